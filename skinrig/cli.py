@@ -114,6 +114,7 @@ for command in (
     rendering.render,
     editing.edit,
     showing.report,
+    showing.status,
     showing.view,
     export.export,
 ):

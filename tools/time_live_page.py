@@ -1,6 +1,7 @@
 """Time frames of the live page with one head and with five, in a headless browser.
 
-    python tools/time_live_page.py [PAGE.html] [--size-px 512] [--frames 8] [--distances] [--gpu]
+    python tools/time_live_page.py [PAGE.html] [--size-px 512] [--frames 8] [--gpu]
+        [--distances | --lights]
 
 Without a page it draws the procedural head. A frame is timed whole (an expression that changes) and
 as the light turns. Jimenez et al. 2010 report 53 frames per second for five heads on a graphics
@@ -8,10 +9,14 @@ card; the browser without --gpu draws on the processor (SwiftShader).
 
 With --distances it compares images with and without the level of detail of wrinkles: the bound of
 the error that the page computes, the error of the image, and texture reads of the surface pass.
+
+With --lights it prints the time of the first paint, and times frames of one head by light and by
+what moves; processor seconds are those of all processes of the browser.
 """
 
 import argparse
 import base64
+import os
 import shutil
 import statistics
 import tempfile
@@ -57,6 +62,57 @@ def compare_detail(page: Any, distance_mm: float, asked: Any) -> tuple[float, ..
     return state["pixel_mm"], state["error"], error, *times
 
 
+LIGHTINGS = {
+    "key light": {"fill": 0, "rim": 0, "environment": "none"},
+    "three-point": {"light_intensity": 2.2, "fill": 0.3, "rim": 0.3, "environment": "none"},
+    "overcast sky": {"fill": 0, "rim": 0, "light_intensity": 0, "environment": "overcast"},
+}
+MOVED = {
+    "camera": "i => ({camera_yaw_deg: i + 1})",
+    "light": "i => ({light_azimuth_deg: i + 1})",
+    "expression": "i => ({weights: {anger: 0.02 * i + 0.1}})",
+}
+
+
+def browser_seconds() -> float:
+    """Return the processor seconds of all processes below this one."""
+    parents, seconds = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            words = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue  # the process has ended
+        own = int(stat.parent.name)
+        parents[own] = int(words[1])
+        seconds[own] = (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    below = {os.getpid()}
+    while more := {one for one, parent in parents.items() if parent in below} - below:
+        below |= more
+    return sum(seconds[one] for one in below if one in seconds)
+
+
+def time_lights(page: Any, frames: int) -> None:
+    """Print the first paint, and milliseconds and processor seconds per frame by light."""
+    entry = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
+    paint = page.evaluate(f"() => {entry}")
+    print(f"first contentful paint: {paint:.0f} ms")
+    print("light | moved | ms | processor seconds")
+    for name, lighting in LIGHTINGS.items():
+        page.evaluate("change => window.viewer.set(change)", lighting)
+        for moved, change in MOVED.items():
+            page.evaluate(f"() => window.viewer.set(({change})(99))")  # compiles its passes
+            before = browser_seconds()
+            found = page.evaluate(
+                f"""frames => Array.from({{length: frames}}, (_, i) => {{
+                  const begun = performance.now();
+                  window.viewer.set(({change})(i));
+                  return performance.now() - begun; }})""",
+                frames,
+            )
+            spent = (browser_seconds() - before) / frames
+            print(f"{name} | {moved} | {statistics.median(found):.0f} | {spent:.3f}", flush=True)
+
+
 def read_buffer(page: Any, name: str) -> Any:
     """Return the first three channels of a buffer of the page, (H, W, 3)."""
     found = page.evaluate("name => window.viewer.read(name)", name)
@@ -71,6 +127,7 @@ def main() -> None:
     parser.add_argument("--size-px", type=int, default=512)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--distances", action="store_true")
+    parser.add_argument("--lights", action="store_true")
     parser.add_argument("--state", default="surprise")
     parser.add_argument("--gpu", action="store_true")
     asked = parser.parse_args()
@@ -89,7 +146,9 @@ def main() -> None:
         view.goto(file.resolve().as_uri())
         view.wait_for_selector("html[data-ready=true]", state="attached", timeout=120_000)
         view.evaluate("s => window.viewer.resize(s, s)", asked.size_px)
-        if asked.distances:
+        if asked.lights:
+            time_lights(view, asked.frames)
+        elif asked.distances:
             print("distance, mm | pixel, mm | bound | RMS error | omitted | ms, ms without")
             for distance_mm in DISTANCES_MM:
                 mm, bound, error, ms, without = compare_detail(view, distance_mm, asked)

@@ -134,6 +134,22 @@ def reconstruct(
     return outcome
 
 
+def list_maps(session: str | Path) -> list[str]:
+    """Return the names of the maps that a session yields, in the order of its recipe.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder.
+
+    Raises
+    ------
+    InputsError, SessionError
+        If the session shows no subject, or is damaged.
+    """
+    return list(recipe_for_session(Session.open(session)).maps)
+
+
 def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions) -> None:
     options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
     given = [name for name, value in options.items() if value is not None]

@@ -67,7 +67,7 @@ def plot_error_against_time(stage: str, document: Mapping[str, Any]) -> str:
     _set_up_axes(axes, f"{stage}, small size" if small else stage, document["error_name"])
     legend = None
     if axes.get_legend_handles_labels()[0]:
-        legend = axes.legend(fontsize=6, frameon=False)
+        legend = axes.legend(fontsize=figures.SMALL_TEXT_PT, frameon=False)
     ends = np.stack([error - bars[0], error + bars[1]])
     point_names.name_points(
         figure,
@@ -190,5 +190,5 @@ def plot_compared_fronts(
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
     axes.margins(x=0.15, y=0.2)
     _set_up_axes(axes, stage, a[1]["error_name"])
-    axes.legend(fontsize=7, frameon=False)
+    axes.legend(fontsize=figures.SMALL_TEXT_PT, frameon=False)
     return figures.to_svg(figure, f"{stage}: {'; '.join(summaries)}")

@@ -30,6 +30,11 @@ BAND_COLUMNS = (
 )
 """Columns of the errors by band; "over lightest" is the error over that of the lightest band."""
 
+FRONT_MEANS = (
+    "Pareto front: no other setting is both faster and more accurate; knee: more time beyond it "
+    "improves the error least"
+)
+
 
 def print_tables(document: Mapping[str, Any], console: Console) -> None:
     """Print each stage's points and limits, a summary line per stage, and omitted stages.
@@ -81,6 +86,8 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         ),
         [_line(name, stage) for name, stage in document["stages"].items()],
     )
+    if any(stage["fronts"] for stage in document["stages"].values()):
+        console.print_line(FRONT_MEANS)
     if found := list_band_rows(document):
         console.print_line()
         console.print_table(BAND_COLUMNS, found)
@@ -178,8 +185,8 @@ def _cell(value: float | None) -> float | str:
 
 def _place(point: Mapping[str, Any]) -> str:
     if point["knee"]:
-        return "front, knee"
-    return "front" if point["on_front"] else ""
+        return "Pareto front, knee"
+    return "Pareto front" if point["on_front"] else ""
 
 
 def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:

@@ -5,6 +5,9 @@ calls them, so their imports do not slow down any command.
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
+
+import typer
 
 from skinrig.next_steps import CALIBRATION_BY_TARGET, DEFAULT_WANTS
 
@@ -37,16 +40,26 @@ def complete_calibrations(incomplete: str) -> list[str]:
     return filter_by_prefix(kinds, incomplete)
 
 
-def complete_wants(incomplete: str) -> list[str]:
-    """Complete a list of maps that sessions are usually reconstructed to.
+def complete_wants(context: typer.Context, incomplete: str) -> list[str]:
+    """Complete a list of maps: those of the given session's rig, else those of any rig."""
+    names: Iterable[str] = ()
+    given = context.params.get("sessions") or ()
+    with suppress(Exception):  # completion offers names of any rig for a damaged session
+        from reconstruction.pipeline.recipes import list_maps
+
+        names = list_maps(given[0]) if given else ()
+    return complete_list(names or list_usual_maps(), incomplete)
+
+
+def list_usual_maps() -> list[str]:
+    """Return the maps that sessions of any rig are usually reconstructed to.
 
     Examples
     --------
-    >>> complete_wants("melanin,hemo")
-    ['melanin,hemoglobin']
+    >>> list_usual_maps()[:2]
+    ['melanin', 'hemoglobin']
     """
-    names = dict.fromkeys(name for text in DEFAULT_WANTS.values() for name in text.split(","))
-    return complete_list(names, incomplete)
+    return list(dict.fromkeys(name for text in DEFAULT_WANTS.values() for name in text.split(",")))
 
 
 def complete_subjects(incomplete: str) -> list[str]:

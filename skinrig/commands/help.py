@@ -28,11 +28,20 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
         ),
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
-    ("Report, render and export", ("report", "view", "render", "export")),
+    ("Report, render and export", ("report", "status", "view", "render", "export")),
     ("Measure errors and run times", ("bench", "soak")),
 )
 OTHER_SECTION: Final = "More"
 
+
+FURTHER_OPTIONS: Final = (
+    *("--session-seed", "--days-ago", "--plan", "--consent", "--consent-expires"),
+    *("--omit", "--renderer", "--movement", "--mesh", "--wrapped", "--scanner"),
+    *("--prompt-period", "--shot-period", "--captures", "--duration", "--relaxation"),
+    *("--camera-offset-mm", "--subsurface", "--interreflections"),
+)
+"""Options that the help of a command with `HELP_ALL` names without text: one screen suffices."""
+HELP_ALL: Final = "--help-all"
 
 FORMER_IMPORT_NAMES: Final = {"lp": "olat"}
 
@@ -155,7 +164,29 @@ class ImportCommands(Subcommands):
 
 
 class RigCommand(Command):
-    """A command of one rig; an option of other rigs is refused with their names."""
+    """A command of one rig; an option of other rigs is refused with their names.
+
+    Where it has ``--help-all``, its help names rarely used options without text.
+    """
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the options; those of `FURTHER_OPTIONS` by name only, without `HELP_ALL`."""
+        own = _options(self)
+        short = HELP_ALL in own and not ctx.meta.get(HELP_ALL)
+        further = tuple(name for name in FURTHER_OPTIONS if name in own and short)
+        if not further:
+            super().format_options(ctx, formatter)
+            return
+        hidden = [cast(Any, one) for one in self.params if set(further) & set(one.opts)]
+        for one in hidden:
+            one.hidden = True
+        try:
+            super().format_options(ctx, formatter)
+        finally:
+            for one in hidden:
+                one.hidden = False
+        with formatter.section(f"Further options ({HELP_ALL} explains them)"):
+            formatter.write_text(", ".join(further))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; raise `UsageError` for an option of another rig."""

@@ -103,6 +103,12 @@ def bench(
         )
         if out is not None:
             bench_table.write_tables(document, out)
+    missed = [
+        name
+        for name, found in document.get("stages", {}).items()
+        if not all(limit["passed"] for limit in found["limits"])
+    ]
+    console.print_each("repeat", (f"skinrig bench --stage {name}" for name in missed))
     console.print_document(document.pop("schema"), document)
     if not document["passed"]:
         raise typer.Exit(errors.EXIT_LIMIT_MISSED)

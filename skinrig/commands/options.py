@@ -14,6 +14,7 @@ import typer
 
 from skinrig.atomic_file import require_writable
 from skinrig.commands import completion
+from skinrig.commands.help import HELP_ALL
 from skinrig.errors import UnusableError, UsageError, require_choice
 
 if TYPE_CHECKING:
@@ -50,6 +51,23 @@ def choice(*values: str, text: str | None = None, metavar: str | None = None) ->
 
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
+
+
+def _print_full_help(context: typer.Context, given: bool) -> bool:
+    """Print the help with all options, and end the command."""
+    if given and not context.resilient_parsing:
+        context.meta[HELP_ALL] = True
+        typer.echo(context.get_help())
+        raise typer.Exit
+    return given
+
+
+HelpAll = Annotated[
+    bool,
+    typer.Option(
+        HELP_ALL, is_eager=True, callback=_print_full_help, help="Show all options and exit."
+    ),
+]
 Seed = Annotated[int, option("Random seed.")]
 DaysAgo = Annotated[
     int,
@@ -75,6 +93,9 @@ def _check_output_place(context: typer.Context, out: Path | None) -> Path | None
 
 
 Out = Annotated[Path, option("Folder to write.", "--out", callback=_check_output_place)]
+OptionalOut = Annotated[
+    Path | None, option("Folder to write.", "--out", callback=_check_output_place)
+]
 
 
 def _check_output_folder(context: typer.Context, out: Path) -> Path:

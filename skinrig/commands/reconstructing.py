@@ -9,11 +9,12 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, MeshFile, NewMaps, Out, choice, command
+from skinrig.commands.options import Json, MeshFile, NewMaps, OptionalOut, Out, choice, command
 from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
-from skinrig.errors import UnusableError
-from skinrig.next_steps import shell_quote
+from skinrig.errors import UnusableError, UsageError
+from skinrig.next_steps import shell_quote, suggest
+from skinrig.workspace import scan
 
 
 @command
@@ -55,10 +56,19 @@ def calibrate(
     rows = [(name.replace("_", " "), value) for name, value in done.summary]
     console.print_table(("quantity", "value"), rows)
     console.print_each("found", done.findings)
-    for change in done.drift:
-        if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
-            console.print_line(f"drift: {change}")
-    console.print_line(f"{done.path}: valid until {done.calibration.valid_until}")
+    drift = [
+        one for one in done.drift if one.change and (one.sigmas is None or abs(one.sigmas) > 2)
+    ]
+    console.print_each("drift", drift)
+    remarks = [
+        *([format_count(len(done.findings), "finding")] if done.findings else []),
+        *([f"drift of {format_count(len(drift), 'value')}"] if drift else []),
+    ]
+    verdict = f"check {' and '.join(remarks)} before use" if remarks else "usable, no finding"
+    console.print_line(f"{done.path}: {verdict}; valid until {done.calibration.valid_until}")
+    for step in suggest(scan(out.parent), out.parent):
+        if step.command.startswith("skinrig reconstruct"):
+            console.print_line(f"next: {step.command}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
     console.print_document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
@@ -98,8 +108,9 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
     /,
-    maps: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
-    out: Out,
+    maps: Annotated[str | None, typer.Option(autocompletion=completion.complete_wants)] = None,
+    out: OptionalOut = None,
+    list_maps: Annotated[bool, typer.Option("--list")] = False,
     calibration: Path | None = None,
     state: str = "neutral",
     scan: Path | None = None,
@@ -136,7 +147,9 @@ def reconstruct(
     sessions
         SESSION/ folder; several are reconstructed one by one.
     maps
-        Maps to compute, separated by commas; an unknown name lists the valid ones.
+        Maps to compute, separated by commas (required without --list).
+    list_maps
+        Print the names of the maps that each session yields, and compute nothing.
     """
     from model.store import FORMER_MAP_NAMES
     from reconstruction.pipeline import recipes as pipeline
@@ -144,6 +157,15 @@ def reconstruct(
     from skinrig.appearances.state_truth import find_comparison_truth
 
     console = Console(json)
+    if list_maps:
+        _print_maps(sessions, console)
+        return
+    if maps is None or out is None:
+        missing = "--maps" if maps is None else "--out"
+        raise UsageError(
+            f"{missing}: not given; name the maps and the folder, as --maps melanin --out maps; "
+            "--list prints the maps of a session"
+        )
     check_rank(rank, merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
     wants = replace_former_values(wants, FORMER_MAP_NAMES)
@@ -176,6 +198,16 @@ def reconstruct(
     console.print_document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )
+
+
+def _print_maps(sessions: Sequence[Path], console: Console) -> None:
+    """Print the names of the maps that each session yields."""
+    from reconstruction.pipeline.recipes import list_maps
+
+    found = {str(session): list_maps(session) for session in sessions}
+    for session, names in found.items():
+        console.print_line(f"{session}: {', '.join(names)}" if len(found) > 1 else "\n".join(names))
+    console.print_document("skinrig.maps/1", {"maps": found})
 
 
 def assign_output_folders(sessions: Sequence[Path], out: Path) -> list[Path]:

@@ -7,11 +7,20 @@ from typing import Annotated, Any
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import STDOUT_MARK, Json, Page, check_output_file, command
+from skinrig.commands.options import (
+    STDOUT_MARK,
+    Json,
+    Page,
+    check_output_file,
+    check_output_page,
+    command,
+)
 from skinrig.console import Console, select_attributes
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import EXIT_LIMIT_MISSED, UnusableError, UsageError
 
 MAX_PORT = 65_535
+FACE_PX, PEOPLE_PX = 2048, 1024
+"""Sides of the textures of one face and of several, texels: both pages stay below 5 MB."""
 
 
 @command
@@ -68,11 +77,61 @@ def report(
             talk.print_line(str(verdict))
     if not piped:
         talk.print_line(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
-    missed = sum(not check.passed for check in done.checks)
-    figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
+    missed = [check for check in done.checks if not check.passed]
+    for check in missed:
+        if check.command:
+            talk.print_line(f"missed: {check.name}; repeat: {check.command}")
+    figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": len(missed)}
+    figures["repeat"] = {check.name: check.command for check in missed if check.command}
     sessions = {name: verdict.document() for name, verdict in done.sessions.items()}
     figures |= {"compared": done.compared, "sessions": sessions}
     console.print_document("skinrig.report/1", figures)
+
+
+@command
+def status(
+    folder: Path,
+    /,
+    out: Annotated[Path | None, typer.Option("-o", "--out", callback=check_output_page)] = None,
+    json: Json = False,
+) -> None:
+    """List the state of every result in a folder, and the command that repeats a failed check.
+
+    The exit code is 1 if a result needs work or a check missed its limit.
+
+    Example: skinrig status demo
+
+    Example: skinrig status demo -o status.html
+
+    Parameters
+    ----------
+    folder
+        Folder of results, such as that of a demo.
+    out
+        HTML page to write; default: none.
+    """
+    from datetime import date
+
+    from skinrig.atomic_file import write_atomically
+    from skinrig.reporting.status import build_status_page, read_status
+
+    console = Console(json)
+    found = read_status(folder, today=date.today())
+    console.print_line(found.headline())
+    rows = [(one.name, one.state, one.detail) for one in found.results]
+    console.print_table(("result", "state", "detail"), rows)
+    for fault in found.faults:
+        if fault.command:
+            console.print_line(f"{fault.name}: {fault.state}; run in {folder}: {fault.command}")
+    for check in found.missed:
+        again = check.command or "unknown"
+        console.print_line(f"missed: {check.name}; repeat in {folder}: {again}")
+    if out is not None:
+        write_atomically(out, build_status_page(found))
+        console.print_line(f"{out}: open it in a browser")
+    console.print_document("skinrig.status/1", found.document() | {"path": out})
+    if found.faults or found.missed:
+        raise typer.Exit(EXIT_LIMIT_MISSED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +167,15 @@ class HeadOptions:
     seed
         Random seed of the simulated head.
     size_px
-        Width and height of textures, texels, 64 to 4096.
+        Width and height of textures, texels, 64 to 4096; default 2048, with people 1024.
+    people
+        Skin types of several simulated people on one head, separated by commas: II,IV,VI.
     """
 
     preset: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III"
     seed: int = 0
-    size_px: int = 2048
+    size_px: int | None = None
+    people: str | None = None
 
 
 @command
@@ -136,6 +198,8 @@ def view(
 
     Example: skinrig view demo/appearance-dome-III --size-px 1024 --port 0
 
+    Example: skinrig view --people II,IV,VI -o people.html
+
     Parameters
     ----------
     appearance
@@ -146,6 +210,7 @@ def view(
         Heights of microstructure, um, over the mesh's texture (with --port): .npy file of
         `skinrig apply microstructure`, 4096 x 4096 or 16384 x 16384.
     """
+    from skinrig.capturing.option_values import parse_names
     from skinrig.viewer import faces, page, server
 
     console = Console(json)
@@ -154,9 +219,12 @@ def view(
     if displacement is not None and port is None:
         raise UsageError("displacement: needs a served page; add --port 0")
     given = select_attributes(face, "mesh", "landmarks", "calibration")
-    given |= select_attributes(head, "preset", "seed") | {"size": head.size_px}
+    people = tuple(parse_names(head.people) or ())
+    side = head.size_px or (PEOPLE_PX if people else FACE_PX)
+    given |= select_attributes(head, "preset", "seed") | {"size": side, "people": people}
     console.progress("making textures and tables")
-    scene = faces.build_scene(appearance or [], **given)
+    scene = faces.build_scene(appearance or [], **given, progress=console.progress)
+    console.progress("packing")
     document: dict[str, Any]
     if port is None:
         document = page.write(scene, out)

@@ -62,6 +62,7 @@ class SimulateOptions:
     consent_expires: options.ConsentExpires = None
     resume: options.Resume = False
     json: options.Json = False
+    help_all: options.HelpAll = False
 
     def request_fields(self, subject: str, console: Console) -> dict[str, Any]:
         """Return the fields that requests of all rigs share."""

@@ -3,6 +3,7 @@
 "use strict";
 (() => {
   const MASKED_GRAY = Number(document.currentScript.dataset.maskedGray);
+  const FLIP_MS = 500;
   const FOREIGN_COLOR = 400; // squared distance in 8-bit sRGB beyond which a color is not of the bar
 
   const IMAGES = 'img, a[href^="#image-"]';
@@ -57,7 +58,8 @@
       if (stops.length < 2) return `red, green, blue ${color.join(", ")} of 255, sRGB`;
       const { at, distance } = locate(color, stops);
       if (distance > FOREIGN_COLOR) return "no value";
-      return `≈ ${(low + at * (high - low)).toPrecision(3)} ${unit}`.trim();
+      const sign = at <= 0 ? "≤" : at >= 1 ? "≥" : "≈"; // the ends show all values beyond
+      return `${sign} ${(low + at * (high - low)).toPrecision(3)} ${unit}`.trim();
     };
     return { part, image, scale, read, title: figure.querySelector("figcaption").textContent };
   };
@@ -76,12 +78,17 @@
     const right = select("right image", group.length > 1 ? (first + 1) % group.length : first);
     const divider = make("input", { type: "range", min: 0, max: 100, value: group.length > 1 ? 50 : 100, "aria-label": "divider" });
     const values = make("output");
+    const flip = make("button", { type: "button", "aria-pressed": "false" }, "Flip");
+    const gain = make("input", { type: "range", min: 0, max: 32, value: 0, "aria-label": "gain of the difference" });
+    const gainWords = make("label", { class: "gain" }, "Difference: off ", gain);
+    const difference = make("canvas", { class: "difference", role: "img" });
     const bar = make("div");
     const stage = make("div", { class: "stage" });
     const close = make("button", { type: "button" }, "Close");
     const dialog = make("dialog", { class: "enlarged", "aria-label": names[first] });
     const controls = make("div", { class: "controls" }, left);
     if (group.length > 1) controls.append(divider, right);
+    if (group.length > 1) controls.append(flip, gainWords);
     controls.append(close);
     dialog.append(controls, stage, bar, values);
 
@@ -94,9 +101,55 @@
       );
       stage.style.setProperty("--divider", `${divider.value}%`);
       stage.style.setProperty("--aspect", a.image.naturalWidth / a.image.naturalHeight);
+      subtract(a, b);
       bar.replaceChildren(...(a.scale ? [a.scale.parentElement.cloneNode(true)] : []));
       values.textContent = "Move the pointer over the image for its values.";
     };
+    // left minus right in sRGB, times the gain, around gray
+    const subtract = (a, b) => {
+      const factor = Number(gain.value);
+      gainWords.firstChild.textContent = factor ? `Difference × ${factor} ` : "Difference: off ";
+      gain.setAttribute("aria-valuetext", factor ? `times ${factor}` : "off");
+      divider.disabled = factor > 0;
+      if (!factor) {
+        difference.remove();
+        return;
+      }
+      const [width, height] = [a.image.naturalWidth, a.image.naturalHeight];
+      [difference.width, difference.height] = [width, height];
+      const context = difference.getContext("2d", { willReadFrequently: true });
+      const [first, second] = [a, b].map((one) => {
+        context.drawImage(one.image, 0, 0, width, height);
+        return context.getImageData(0, 0, width, height);
+      });
+      first.data.forEach((code, i) => {
+        if (i % 4 < 3) first.data[i] = 128 + factor * (code - second.data[i]);
+      });
+      context.putImageData(first, 0, 0);
+      difference.setAttribute("aria-label", `${a.title} minus ${b.title}, times ${factor}, around gray`);
+      stage.append(difference);
+    };
+    // both images in turn, twice a second
+    let flipping = 0;
+    const stop = () => {
+      clearInterval(flipping);
+      flipping = 0;
+      flip.setAttribute("aria-pressed", "false");
+    };
+    flip.addEventListener("click", () => {
+      if (flipping) return stop();
+      flip.setAttribute("aria-pressed", "true");
+      gain.value = 0;
+      draw();
+      flipping = setInterval(() => {
+        divider.value = Number(divider.value) < 50 ? 100 : 0;
+        stage.style.setProperty("--divider", `${divider.value}%`);
+      }, FLIP_MS);
+    });
+    gain.addEventListener("input", () => {
+      stop();
+      subtract(...shown());
+    });
     stage.addEventListener("pointermove", (event) => {
       const box = stage.getBoundingClientRect();
       const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
@@ -108,9 +161,15 @@
       values.textContent = texts.join("; ");
     });
     for (const field of [left, right]) field.addEventListener("change", draw);
-    divider.addEventListener("input", () => stage.style.setProperty("--divider", `${divider.value}%`));
+    divider.addEventListener("input", () => {
+      stop();
+      stage.style.setProperty("--divider", `${divider.value}%`);
+    });
     close.addEventListener("click", () => dialog.close());
-    dialog.addEventListener("close", () => dialog.remove());
+    dialog.addEventListener("close", () => {
+      stop();
+      dialog.remove();
+    });
     document.body.append(dialog);
     draw();
     dialog.showModal();

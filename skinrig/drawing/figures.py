@@ -11,6 +11,8 @@ from skinrig.arrays import FloatArray
 from skinrig.drawing import svg
 
 SERIES_COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
+SMALL_TEXT_PT = 9
+"""Size of the smallest text of a plot, points; 12 pixels in a browser."""
 
 
 def create_canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
@@ -51,7 +53,7 @@ def format_log_axes(*log_axes: Any) -> None:
         few = high < 30.0 * low
         some = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
         axis.set_minor_formatter(some if few else NullFormatter())
-        axis.set_tick_params(which="minor", labelsize=7)
+        axis.set_tick_params(which="minor", labelsize=SMALL_TEXT_PT)
 
 
 def format_range(values: FloatArray) -> str:
@@ -85,7 +87,7 @@ def draw_bars(
         known = zip(labels, heights, strict=True)
         shown = (f"{' '.join(label.split())} {h:.3g}" for label, h in known if np.isfinite(h))
         words.append(f"{name}: {', '.join(shown)}")
-    axes.set_xticks(position, labels, fontsize=8)
+    axes.set_xticks(position, labels, fontsize=SMALL_TEXT_PT)
     _title(axes, title, y_name=unit)
     held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
     return to_svg(figure, f"{title}, {unit}: {'; '.join(words)}{held}")
@@ -95,7 +97,7 @@ def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
     axes.set_xlabel(x_name)
     axes.set_ylabel(y_name)
     axes.set_title(title, fontsize=10)
-    axes.legend(fontsize=7, frameon=False)
+    axes.legend(fontsize=SMALL_TEXT_PT, frameon=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +178,10 @@ def draw_sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: Flo
         contour = axes.contour(
             np.cbrt(c_m), np.cbrt(c_hd), shown, [1, 3, 10, 30, 100], colors="w", linewidths=0.7
         )
-        axes.clabel(contour, fmt="%g %%", fontsize=7)
+        axes.clabel(contour, fmt="%g %%", fontsize=SMALL_TEXT_PT)
     ticks = np.array([0.001, 0.01, 0.05, 0.15, 0.3, 0.5])
-    axes.set_xticks(np.cbrt(ticks), [f"{t:g}" for t in ticks], fontsize=7)
-    axes.set_yticks(np.cbrt(ticks[:-1]), [f"{t:g}" for t in ticks[:-1]], fontsize=7)
+    axes.set_xticks(np.cbrt(ticks), [f"{t:g}" for t in ticks], fontsize=SMALL_TEXT_PT)
+    axes.set_yticks(np.cbrt(ticks[:-1]), [f"{t:g}" for t in ticks[:-1]], fontsize=SMALL_TEXT_PT)
     axes.set_xlim(np.cbrt(c_m[0]), np.cbrt(c_m[-1]))
     axes.set_ylim(np.cbrt(c_hd[0]), np.cbrt(c_hd[-1]))
     axes.set_xlabel("melanosome volume fraction C_m")

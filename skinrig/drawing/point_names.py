@@ -15,6 +15,8 @@ _LABEL_OFFSETS = tuple(
     for x, y in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1))
 )
 """Candidate offsets of a label from its point, points, with the label's aligned corner."""
+LABEL_PT = 8
+"""Size of a label's text, points."""
 
 
 def name_points(
@@ -63,7 +65,9 @@ def name_points(
     for label, x, y in labels:
         if not label:
             continue
-        words = axes.annotate(label, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=6)
+        words = axes.annotate(
+            label, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=LABEL_PT
+        )
         words.set_in_layout(False)  # a long label must not shrink the axes
         found = None
         for place in _LABEL_OFFSETS:

@@ -32,7 +32,10 @@ KEYS_BY_QUANTITY: Final = {
     "diffuse mean free path, green": "translucency",
 }
 """Quantities in the order of the first screen, with patterns of their maps, the best first."""
-GRAY_MEANS: Final = "Gray pixels are masked: background, hair, eyes, or no valid estimate."
+GRAY_MEANS: Final = (
+    "Gray pixels are masked: background, hair, eyes, or no valid estimate. Values beyond a color "
+    "scale have the color of its end."
+)
 NORMAL_LEGEND: Final = "x red, y green, z blue: −1 to 1"
 Box = tuple[FloatArray, FloatArray]
 
@@ -101,6 +104,7 @@ def draw_first_screen(
             Candidate.of(name, key, appearance, truths.get(name))
             for name, appearance in appearances.items()
             for key in _keys(appearance, pattern)
+            if key != "translucency" or not subsurface.is_homogeneous(truths.get(name))
         ]
         best = next((one for one in found if one.other is not None), found[0] if found else None)
         if best is not None and len(panels) < MAX_PANELS:

@@ -14,6 +14,8 @@ from skinrig.unit_format import format_quantity
 
 GRAY_LINEAR = float(png.INVALID_GRAY / 255.0) ** 2.2
 """Linear value of the gray of pixels without a value."""
+OUTER_FENCE = 3.0
+"""Interquartile ranges from the quartiles to Tukey's outer fences (Tukey 1977)."""
 SCALE_COLORS = 128
 """Colors of a map's image: it resolves 1/128 of its scale."""
 
@@ -153,9 +155,24 @@ def compute_percentile_reach(values: FloatArray, mask: BoolArray, percentile: fl
 
 
 def compute_shared_range(maps: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of all finite values of several maps."""
+    """Return the ends of a color scale for all finite values of several maps.
+
+    They are the 1st and 99th percentile, within Tukey's outer fences: a small part of very
+    different values, such as the lips of a face, does not set the scale of the rest.
+
+    Examples
+    --------
+    >>> face, lips = np.linspace(0.01, 0.02, 1000), np.full(30, 0.05)
+    >>> [round(end, 4) for end in compute_shared_range([np.concatenate([face, lips])])]
+    [0.0101, 0.0332]
+    """
     joined = np.concatenate([one[np.isfinite(one)] for one in maps])
-    low, high = np.percentile(joined, [1, 99]).tolist() if joined.size else (0.0, 1.0)
+    if not joined.size:
+        return 0.0, 1.0
+    low, first, third, high = np.percentile(joined, [1, 25, 75, 99]).tolist()
+    reach = OUTER_FENCE * (third - first)
+    if reach > 0.0:
+        low, high = max(low, first - reach), min(high, third + reach)
     return low, high
 
 

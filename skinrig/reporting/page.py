@@ -47,6 +47,8 @@ class Check:
     """Group with the largest error, in words: a melanin band, a strain step, a channel."""
     worst_got: float = float("nan")
     """Lower bound of the error in that group, in ``unit``; NaN where it is not comparable."""
+    command: str = ""
+    """Command that repeats it, in the folder of the results; empty: unknown."""
 
     @property
     def passed(self) -> bool:
@@ -70,11 +72,14 @@ class ReportedAppearance:
     truth: SkinAppearance | None
     checks: list[Check]
     """Sections append their checks."""
+    command: str = ""
+    """Command that makes the maps again; empty: unknown."""
 
     def check(
         self, quantity: str, got: float, bound: float, unit: str = "", note: str = "", **more: Any
     ) -> None:
         """Add the check of a number against its upper limit."""
+        more = {"command": self.command} | more
         self.checks.append(Check(f"{self.name}: {quantity}", got, bound, "<=", unit, note, **more))
 
     def check_fraction(

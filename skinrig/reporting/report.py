@@ -11,7 +11,7 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.evaluating.session_agreement import SessionAgreement
-from skinrig.reporting import first_screen, map_images, page, provenance
+from skinrig.reporting import first_screen, map_images, page, provenance, repeating
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
@@ -163,7 +163,7 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
     for blocks in (
         _maps(found, appearances, checks),
         _documents(found, checks),
-        calibration.section(found.calibrations, appearances, sessions, checks),
+        calibration.section(found.calibrations, appearances, sessions, checks, found.sessions),
     ):
         deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
@@ -185,7 +185,7 @@ def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.B
         *chromophore.draw_identifiability(appearances.values()),
         *subsurface.compare_people(appearances, found.truths),
         *_documents(found, checks),
-        *calibration.section(found.calibrations, appearances, sessions, checks),
+        *calibration.section(found.calibrations, appearances, sessions, checks, found.sessions),
         *session.list_omissions(found.sessions),
         *provenance.consent_section([found]),
         *session.section(sessions),
@@ -197,12 +197,13 @@ def _maps(
 ) -> Iterator[page.Block]:
     for name, appearance in appearances.items():
         if dynamic.is_dynamic(appearance):
-            yield from _dynamic_section(
-                page.ReportedAppearance(name, appearance, None, checks), found
-            )
+            subject = page.ReportedAppearance(name, appearance, None, checks)
+            yield from _dynamic_section(subject, found)
         else:
             truth = found.find_truth(appearance)
-            yield from _appearance_section(page.ReportedAppearance(name, appearance, truth, checks))
+            again = repeating.repeat_maps(name, appearance, found)
+            subject = page.ReportedAppearance(name, appearance, truth, checks, again)
+            yield from _appearance_section(subject)
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
 

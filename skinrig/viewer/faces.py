@@ -53,6 +53,10 @@ ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
 """Weights of ARKit shapes, without side, by expression."""
 
 
+def _ignore(_content: str) -> None:
+    """Report no progress."""
+
+
 def build_presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     """Build blend-shape weights by preset, in display order.
 
@@ -102,21 +106,26 @@ def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return total
 
 
-ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
-    facial_color_assets.build_assets,
-    reflectance_assets.build_default_scattering,
-    wrinkle_assets.build_surface_assets,
-    fitted_assets.build_assets,
-    wrinkle_assets.build_assets,
-    microstructure_assets.build_assets,
+ASSET_BUILDERS: Final[Mapping[str, Callable[[SceneSource], Assets]]] = MappingProxyType(
+    {
+        "blood, melanin and their colors": facial_color_assets.build_assets,
+        "scattering": reflectance_assets.build_default_scattering,
+        "surface topography": wrinkle_assets.build_surface_assets,
+        "basis BRDFs and traits": fitted_assets.build_assets,
+        "wrinkles": wrinkle_assets.build_assets,
+        "microstructure": microstructure_assets.build_assets,
+    }
 )
-"""Builders of the page's assets, in the order of its parts; they are independent."""
+"""Builders of the page's assets by content, in the order of its parts; they are independent."""
 
 
-def assemble_scene(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
-    """Assemble the scene of a source from all asset builders."""
+def assemble_scene(
+    source: SceneSource, provenance: Mapping[str, Any], progress: Callable[[str], None] = _ignore
+) -> ViewerScene:
+    """Assemble the scene of a source from all asset builders; ``progress`` gets each content."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance)
-    for build in ASSET_BUILDERS:
+    for content, build in ASSET_BUILDERS.items():
+        progress(content)
         scene = scene.with_assets(build(source))
     names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
     return scene.with_assets(
@@ -144,6 +153,8 @@ def build_scene(
     preset: str = DEFAULT_PRESET,
     seed: int = 0,
     size: int = 2048,
+    people: Sequence[str] = (),
+    progress: Callable[[str], None] = _ignore,
 ) -> ViewerScene:
     """Build the scene of fitted folders, or of a simulated person without any.
 
@@ -165,12 +176,17 @@ def build_scene(
         own seed.
     size
         Side of the large textures, 64 to 4096 texels.
+    people
+        Skin types of several simulated people in place of ``preset``, on the same head.
+    progress
+        Called with each content before it is made.
 
     Raises
     ------
     SceneError
-        If the size is out of range, a folder cannot be displayed, two are of one kind, landmarks
-        are missing, or landmarks or a calibration are not applicable.
+        If the size is out of range, people are given with folders, a folder cannot be displayed,
+        two are of one kind, landmarks are missing, or landmarks or a calibration are not
+        applicable.
     model.store.StoreError
         If a folder is not readable.
     rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
@@ -189,6 +205,11 @@ def build_scene(
         raise SceneError(
             "--calibration: got a folder without a dome's appearance; give the appearance, too"
         )
+    if people and paths:
+        raise SceneError(
+            "--people: got simulated people and an appearance; show one of both, or a page each"
+        )
+    preset = people[0] if people else preset
     folders, appearances = _read(paths)
     whole, mesh_origin = _mesh(appearances, mesh)
     kind: Kind = "procedural" if mesh is None else "mesh"
@@ -198,13 +219,19 @@ def build_scene(
         kind = next(name for name in CAPTURED_KINDS if name in appearances)
     surface = None if whole is None else whole.mesh
     subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
+    progress("fine skin")
     skin = FineSkin(subject, size)
     of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
     source = SceneSource(kind, *of, landmarks, calibration)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
-        return assemble_scene(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
-    found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin))
+        provenance |= {} if mesh is None else {"mesh": mesh.name}
+        if len(people) < 2:
+            return assemble_scene(source, provenance, progress)
+        scene = assemble_scene(source, provenance | {"preset": ", ".join(people)}, progress)
+        progress(f"people {', '.join(people[1:])}")
+        return scene.with_assets(_build_people(people, seed, size, surface))
+    found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin), progress)
     movement = "movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()
     left_out = [*holes, ("expressions of this face", movement)]
@@ -214,6 +241,17 @@ def build_scene(
         )
     found = found.with_assets({"left_out": tuple(left_out)})
     return found if whole is None else _paint_patches(found, whole)
+
+
+def _build_people(people: Sequence[str], seed: int, size: int, surface: Mesh | None) -> Assets:
+    """Build the chromophores of all people but the first, as textures of their own."""
+    textures = {}
+    for number, preset in enumerate(people[1:], start=1):
+        subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
+        found = facial_color_assets.simulate_chromophores(subject, FineSkin(subject, size))
+        for name, texture in facial_color_assets.build_textures(found).items():
+            textures[f"{name}_person_{number}"] = texture
+    return {"textures": textures, "facts": {"people": list(people)}}
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:

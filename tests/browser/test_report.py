@@ -5,6 +5,7 @@ import io
 import os
 import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.reporting import report
 from skinrig.reporting.page import Image, Images, render_page
+from skinrig.reporting.status import build_status_page, read_status
 
 WIDTHS = (1250, 400)
 
@@ -152,8 +154,26 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
         found.append(float(re.search(r"ground truth: ≈ ([0-9.]+)", text)[1]))
     np.testing.assert_allclose(found, expected, atol=0.1 / 64)
     before = dialog.locator(".stage").screenshot()
-    dialog.get_by_role("slider").fill("100")
+    dialog.get_by_role("slider", name="divider").fill("100")
     assert dialog.locator(".stage").screenshot() != before
+    # the difference of two images around gray, and of an image with itself
+    difference = dialog.locator("canvas.difference")
+    spread = """c => Math.max(...c.getContext("2d").getImageData(0, 0, c.width, c.height)
+      .data.map((code, i) => i % 4 < 3 ? Math.abs(code - 128) : 0))"""
+    dialog.get_by_role("slider", name="gain").fill("8")
+    assert difference.evaluate(spread) > 20
+    chosen = dialog.get_by_role("combobox")
+    chosen.nth(1).select_option(chosen.nth(0).input_value())
+    assert difference.evaluate(spread) == 0
+    chosen.nth(1).select_option(str(1 - int(chosen.nth(0).input_value())))
+    dialog.get_by_role("button", name="Flip").click()
+    assert difference.count() == 0
+    side = "() => document.querySelector('.stage').style.getPropertyValue('--divider')"
+    shown = set()
+    for _ in range(6):  # three seconds, 0.5 s each side
+        shown.add(page.evaluate(side))
+        page.wait_for_timeout(500)
+    assert shown == {"0%", "100%"}
     page.keyboard.press("Escape")
     page.locator("dialog").wait_for(state="detached")
     assert problems == []
@@ -202,6 +222,30 @@ def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
         assert findings == []
         assert passes > 10
         context.close()
+
+
+@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1250)])
+def test_axe_accepts_enlarged_image_and_status(browser, pages, axe, tmp_path, scheme, width):
+    context, page, _ = opened(browser, pages[0], scheme=scheme, width=width, bypass_csp=True)
+    page.locator(".maps .enlarge").first.press("Enter")
+    dialog = page.locator("dialog[open]")
+    dialog.get_by_role("slider", name="gain").fill("8")
+    dialog.get_by_role("button", name="Flip").press("Enter")
+    findings, _ = serious(page, axe)
+    assert findings == []
+    box = dialog.bounding_box()
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= width
+    context.close()
+    path = tmp_path / "status.html"
+    path.write_text(build_status_page(read_status(pages[0].parent / "one", today=date(2026, 1, 1))))
+    context, page, problems = opened(browser, path, scheme=scheme, width=width, bypass_csp=True)
+    findings, passes = serious(page, axe)
+    assert findings == []
+    assert passes > 10
+    assert problems == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    context.close()
 
 
 def test_axe_finds_image_without_text_and_low_contrast(browser, pages, axe, tmp_path):

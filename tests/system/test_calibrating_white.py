@@ -27,13 +27,16 @@ def test_small_simulated_white_reference_works_partial_is_reported(tmp_path, cap
     calibration = tmp_path / "calibration"
     command = ["calibrate", "white", str(tmp_path / "tile"), "--out", str(calibration)]
     assert main(command) == 0
-    assert "found:" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "found:" not in said
+    assert "usable, no finding; valid until" in said
+    assert "next:" not in said  # no session of skin is near
     assert (calibration / "white.json").exists()
     monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.9)
     assert main(command) == 0
-    assert (
-        "found: frame S001 of state 'white': 90 % of the image is even" in capsys.readouterr().out
-    )
+    said = capsys.readouterr().out
+    assert "found: frame S001 of state 'white': 90 % of the image is even" in said
+    assert f"check {said.count('found:')} findings before use" in said
     monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.3)
     assert main(command) == 3
     assert "does not show a white reference: 30 %" in capsys.readouterr().err

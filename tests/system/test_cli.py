@@ -26,6 +26,7 @@ WORDS = sorted(registered(app))
 COMMANDS = sorted({words[0] for words in WORDS})
 ROOT = Path(__file__).parents[2]
 RIG_GROUPS = ("plan", "simulate", "capture", "serve")
+MAX_HELP_LINES = 45
 
 
 @pytest.mark.parametrize("words", WORDS, ids=" ".join)
@@ -68,6 +69,20 @@ def test_the_promised_commands_are_there():
         "demo",
     }
     assert promised <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("rig", ["flash", "dome", "gradient", "probe"])
+def test_simulate_help_fits_one_screen_help_all_explains(rig, capsys):
+    assert main(["simulate", rig, "--help"]) == 0
+    short = capsys.readouterr().out
+    assert len(short.splitlines()) <= MAX_HELP_LINES
+    assert main(["simulate", rig, "--help-all"]) == 0
+    whole = capsys.readouterr().out
+    short, _, further = short.partition("Further options (--help-all")
+    named = set(re.findall(r"--[a-z-]+", further))
+    assert "--renderer" in named
+    assert named <= set(re.findall(r"^  (--[a-z-]+)", whole, re.MULTILINE))
+    assert not named & set(re.findall(r"^  (--[a-z-]+)", short, re.MULTILINE))
 
 
 @pytest.mark.parametrize("verb", RIG_GROUPS)

@@ -12,6 +12,7 @@ from capture.rig import load_rig
 from capture.session.disk import Disk
 from skinrig import errors
 from skinrig.cli import main
+from skinrig.commands import completion
 
 
 def photograph(path, color=True, seed=0):
@@ -39,6 +40,22 @@ def test_a_gray_photograph_is_not_offered_for_melanin(photos, tmp_path, capsys, 
     monkeypatch.chdir(tmp_path)
     assert main([]) == 0
     assert "skinrig reconstruct" not in capsys.readouterr().out
+
+
+def test_reconstruct_lists_maps_of_session(photos, tmp_path, capsys):
+    photograph(photos / "portrait.png")
+    session = tmp_path / "session"
+    assert bring(photos, session) == 0
+    capsys.readouterr()
+    assert main(["reconstruct", str(session), "--list"]) == 0
+    listed = capsys.readouterr().out.split()
+    assert {"melanin", "hemoglobin"} <= set(listed)
+    context = SimpleNamespace(params={"sessions": [session]})
+    assert set(completion.complete_wants(context, "")) == set(listed)
+    assert "r_d" not in listed  # a map of the dome
+    assert "r_d" in completion.complete_wants(SimpleNamespace(params={}), "")
+    assert main(["reconstruct", str(session), "--maps", "melanin"]) == 2
+    assert "--out: not given" in capsys.readouterr().err
 
 
 def test_colored_photograph_is_offered_before_gray(photos, tmp_path, capsys, monkeypatch):

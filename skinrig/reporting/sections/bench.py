@@ -37,7 +37,10 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         for limit in stage["limits"]:
             got = float("nan") if limit["got"] is None else limit["got"]
             judged = got, limit["bound"], limit["sense"], limit["unit"]
-            checks.append(page.Check(f"{name}: {limit['name']}", *judged, worst=_worst(stage)))
+            again = f"skinrig bench --stage {name}"
+            checks.append(
+                page.Check(f"{name}: {limit['name']}", *judged, worst=_worst(stage), command=again)
+            )
     plots = [
         bench_figures.plot_error_against_time(name, stage)
         for name, stage in document["stages"].items()

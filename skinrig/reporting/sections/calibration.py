@@ -15,6 +15,7 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import hash_file
 from skinrig.arrays import Float64Array
 from skinrig.reporting import page
+from skinrig.reporting.repeating import repeat_calibration
 from skinrig.reporting.sections.session import SessionFacts
 
 MAX_LISTED_NUMBERS = 12
@@ -62,6 +63,7 @@ def section(
     appearances: Mapping[str, SkinAppearance],
     sessions: Mapping[str, SessionFacts],
     checks: list[page.Check],
+    places: Sequence[Path] = (),
 ) -> Iterator[page.Block]:
     """Yield quality, age at capture and values of calibrations.
 
@@ -75,6 +77,8 @@ def section(
         By name; their days give the age of a calibration.
     checks
         Gets the remaining validity of each folder that was used.
+    places
+        SESSION/ folders; those of targets repeat a calibration.
 
     Notes
     -----
@@ -87,22 +91,24 @@ def section(
     figures: list[tuple[object, ...]] = []
     values: list[page.Collapsible] = []
     for folder in folders:
-        left: list[float] = []
+        left: list[tuple[float, str]] = []
         for path in sorted(folder.glob("*.json")):
             try:
                 found = store.load(folder, path.stem)
             except (CalibrationError, ValueError) as error:
                 ages.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
-                left.append(float("nan"))
+                left.append((float("nan"), ""))
                 continue
             days, row = _age(folder.name, path, found, appearances, sessions)
             ages.append(row)
-            left += days
+            again = repeat_calibration(folder.name, found, places)
+            left += [(one, again) for one in days]
             figures += _figures(folder.name, found)
             values.append(_values(folder.name, found))
         if left:
             name = f"{folder.name}: days of validity left at capture"
-            checks.append(page.Check(name, float(np.min(left)), 0.0, ">=", "d"))
+            least, again = min(left, key=lambda one: -np.inf if np.isnan(one[0]) else one[0])
+            checks.append(page.Check(name, least, 0.0, ">=", "d", command=again))
     yield page.Heading("Calibrations", level=2)
     yield page.build_view("calibrations", ages=ages, figures=figures)
     yield from values

@@ -7,8 +7,10 @@ import numpy as np
 
 from model import microstructure
 from model.facial_color import HemoglobinRig
+from model.facial_color.state_maps import NEUTRAL
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
+from model.tissue_optics.layers import C_HD_MAX
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import clamp_sums, zone_sums
 from skinrig.appearances.dynamic import (
@@ -19,7 +21,7 @@ from skinrig.appearances.dynamic import (
     describe_parts,
 )
 from skinrig.applying.expression import read_hemoglobin_rig, skin_reflectance
-from skinrig.arrays import Float64Array, FloatArray
+from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.reporting import map_images, page
@@ -28,6 +30,8 @@ from skinrig.reporting.map_names import split_melanin_bands
 MAX_SHOWN_EXPRESSIONS = 4
 """Expressions drawn; the tables list all."""
 WIDTH_PX = 240
+CHANGE_GAIN = 4.0
+"""Factor on the change of blood in exaggerated images."""
 ZONE_COLORS = np.array(
     [
         [0.85, 0.1, 0.1],
@@ -180,6 +184,32 @@ def draw_facial_color(
             truth=None if true is None else true.values,
             valid=seen,
         )
+        yield from _change(appearance, state, measured=blend.valid, truths=truths)
+
+
+def _change(
+    appearance: SkinAppearance,
+    state: str,
+    *,
+    measured: BoolArray,
+    truths: Mapping[str, SkinAppearance],
+) -> Iterator[page.Block]:
+    """Draw the change of blood from neutral, the same pixels in both expressions."""
+    change = appearance.maps.get(f"change_{state}")
+    if change is None:
+        return
+    both = [evaluation.true_blood(truths[one]) for one in (state, NEUTRAL) if one in truths]
+    shown, parts = change.mask & measured, [("estimate", change.values)]
+    if len(both) == 2 and both[0] is not None and both[1] is not None:
+        shown = shown & both[0].mask & both[1].mask
+        parts.insert(0, ("ground truth", both[0].values - both[1].values))
+    if not shown.any():
+        return
+    reach = max(map_images.compute_percentile_reach(one, shown, 98) for _, one in parts)
+    title = f"change of the blood volume fraction from neutral to {state}"
+    drawing = map_images.MapDrawing(title, "volume fraction", shown)
+    yield page.Heading(title)
+    yield page.Images([drawing.draw_signed(label, one, reach) for label, one in parts])
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Block]:
@@ -196,10 +226,21 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
         seen = blend.valid & melanin.mask
-        color = skin_reflectance(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        images.append(map_images.draw_color_image(title, color, width=WIDTH_PX))
+        found = [(title, np.where(seen, blend.hemoglobin, 0.0))]
+        if title in names:
+            rest = rig.evaluate(asked["neutral"])
+            both = seen & rest.valid
+            more = rest.hemoglobin + CHANGE_GAIN * (blend.hemoglobin - rest.hemoglobin)
+            found.append((f"{title}, change × {CHANGE_GAIN:g}", np.where(both, more, 0.0)))
+        for words, blood in found:
+            color = skin_reflectance(melanin.values, np.clip(blood, 0.0, C_HD_MAX), seen)
+            color = np.where(seen[..., None], color, map_images.GRAY_LINEAR)
+            images.append(map_images.draw_color_image(words, color, width=WIDTH_PX))
     yield page.Images(images)
-    yield page.build_note("Diffuse reflectance without shading, linear sRGB under D65.")
+    yield page.build_note(
+        "Diffuse reflectance without shading, linear sRGB under D65. Enlarge an image to flip "
+        "between two of them, or to multiply their difference."
+    )
 
 
 def _color_errors(

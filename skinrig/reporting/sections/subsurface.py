@@ -54,7 +54,11 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if fitted is not None and fitted.get("sites"):
         yield page.build_view("sites", sites=fitted["sites"])
-    yield from _map(appearance)
+    if is_homogeneous(subject.truth):
+        if "translucency" in appearance.maps:
+            yield page.build_note("A homogeneous medium has no map over a face; none is drawn.")
+    else:
+        yield from _map(appearance)
 
 
 def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
@@ -179,6 +183,12 @@ def _by_channel(rows: Sequence[evaluation.FitAccuracy]) -> Iterator[page.Block]:
     parts = [label.rpartition(", ") for label in labels]
     short = [f"{_words_of_name(name)}\n{channel}" for name, _, channel in parts]
     yield page.Plots([figures.draw_bars("error of sigma_tr", short, series, unit="%")])
+
+
+def is_homogeneous(truth: SkinAppearance | None) -> bool:
+    """Return whether a ground truth is that of homogeneous media only."""
+    kinds = {str(one["kind"]) for one in evaluation.true_profiles(truth).values()}
+    return kinds == {"homogeneous"}
 
 
 def _map(appearance: SkinAppearance) -> Iterator[page.Block]:

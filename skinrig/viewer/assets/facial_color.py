@@ -137,8 +137,10 @@ TABLE_NODES: Final = 128
 RADIUS_PER_SIZE: Final = 24.0 / 512.0
 """Radius of the disc of local statistics, fraction of the map's side."""
 FINEST_STEP_WORDS: Final = 8
-"""Quantization step of the finest octave for chromophores of 2048 texels per side and more; detail
-below 0.2 mm is noise."""
+"""Quantization step of the finest octave for large chromophore maps; detail below 0.4 mm is mostly
+noise."""
+MIN_ROUNDED_PX: Final = 1024
+"""Side from which on the finest octave of chromophores is rounded, texels."""
 ALBEDO_MAP: Final = "r_d"
 CHROMOPHORE_MAPS: Final = ("melanin", "hemoglobin")
 
@@ -150,13 +152,7 @@ def build_assets(source: SceneSource) -> Assets:
     table = color_table.build(
         spectra.LINEAR_SRGB, "D65", size=TABLE_NODES, anisotropy=ANISOTROPY_SKIN
     )
-    roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
-    textures = {
-        "chromophores": Texture(
-            roots.astype(np.float32), fine=FINEST_STEP_WORDS if len(roots) >= 2048 else 1
-        ),
-        "facial_states": Texture(np.stack(list(found.states.values())).astype(np.float32), "u8"),
-    }
+    textures = build_textures(found)
     names = list(found.states)
     facts: dict[str, Any] = {
         "color_table": {"c_m_max": C_M_MAX, "c_hd_max": C_HD_MAX, "size": TABLE_NODES},
@@ -184,6 +180,17 @@ def build_assets(source: SceneSource) -> Assets:
         "facts": facts,
         "params": {"weights": dict.fromkeys([*names[1:], *source.mesh.shapes], 0.0)},
         "left_out": tuple(left_out.items()),
+    }
+
+
+def build_textures(face: FaceColor) -> dict[str, Texture]:
+    """Build the textures of a face's chromophores and of its blood by expression."""
+    roots = np.cbrt(np.stack([face.melanin, face.hemoglobin], axis=-1))
+    return {
+        "chromophores": Texture(
+            roots.astype(np.float32), fine=FINEST_STEP_WORDS if len(roots) >= MIN_ROUNDED_PX else 1
+        ),
+        "facial_states": Texture(np.stack(list(face.states.values())).astype(np.float32), "u8"),
     }
 
 

@@ -26,10 +26,14 @@ uniform float u_split;
 uniform float u_low;
 uniform float u_high;
 uniform float u_channels;
+uniform float u_difference;
 in vec2 v_uv;
 layout(location = 0) out vec4 o_color;
 void main() {
-  vec4 value = v_uv.x < u_split ? texture(u_first, v_uv) : texture(u_second, v_uv);
+  vec4 a = texture(u_first, v_uv);
+  vec4 b = texture(u_second, v_uv);
+  vec4 value = u_difference > 0.0 ? u_difference * (a - b) : v_uv.x < u_split ? a : b;
   vec3 shown = u_channels > 2.5 ? value.rgb : u_channels > 1.5 ? vec3(value.rg, 0.0) : value.rrr;
-  o_color = vec4((shown - u_low) / (u_high - u_low), 1.0);
+  float low = u_difference > 0.0 ? -0.5 * (u_high - u_low) : u_low;
+  o_color = vec4((shown - low) / (u_high - u_low), 1.0);
 }

@@ -55,9 +55,37 @@ float kelemenSpecular(SurfacePoint s, vec3 n) {
   float fresnel = p_f0 + (1.0 - p_f0) * base * base * base * base * base;
   return max(density * fresnel / dot(whole, whole), 0.0);
 }
+//@chunk environment_light
+// Spherical harmonics of the environment; bands are weighted by the kernel that blurs it.
+uniform vec3 u_environment[9];
+uniform float u_surrounded;
+vec3 environmentLight(vec3 d, vec3 bands) {
+  vec3 first = u_environment[1] * d.y + u_environment[2] * d.z + u_environment[3] * d.x;
+  vec3 second = 1.0925484 * (u_environment[4] * d.x * d.y + u_environment[5] * d.y * d.z
+    + u_environment[7] * d.x * d.z) + 0.3153916 * u_environment[6] * (3.0 * d.z * d.z - 1.0)
+    + 0.5462742 * u_environment[8] * (d.x * d.x - d.y * d.y);
+  return max(bands.x * 0.2820948 * u_environment[0] + bands.y * 0.4886025 * first
+    + bands.z * second, 0.0);
+}
+// Irradiance over pi (Ramamoorthi and Hanrahan 2001).
+vec3 environmentIrradiance(vec3 n) { return environmentLight(n, vec3(1.0, 2.0 / 3.0, 0.25)); }
+// Highlight: a lobe of roughness m around the mirror direction blurs band l by exp(-(l m)^2).
+vec3 environmentHighlight(SurfacePoint s) {
+  float cosine = clamp(dot(s.specularNormal, s.toEye), 0.0, 1.0);
+  float m2 = s.roughness * s.roughness;
+  vec3 light = environmentLight(reflect(-s.toEye, s.specularNormal),
+    vec3(1.0, exp(-m2), exp(-4.0 * m2)));
+  vec2 size = vec2(textureSize(l_environment_brdf, 0));
+  float row = (s.roughness - LEAST_TABLE_M) / (MOST_TABLE_M - LEAST_TABLE_M);
+  vec2 place = (clamp(vec2(cosine, row), 0.0, 1.0) * (size - 1.0) + 0.5) / size;
+  vec2 albedo = table_environment_brdf(place).rg;
+  return light * (p_f0 * albedo.x + albedo.y);
+}
 //@chunk surface_fragment
 uniform vec3 u_eye;
 uniform vec3 u_to_light;
+uniform vec3 u_further_to[2];
+uniform float u_further_intensity[2];
 in float v_depth;
 layout(location = 0) out vec4 o_irradiance;
 layout(location = 1) out vec4 o_albedo;
@@ -88,11 +116,25 @@ void main() {
   float lit = litShare(v_position, s.normal);
   vec3 cosines = lit * clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
   vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
+  float facing = lit * clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
+  vec3 specular = PI * p_light_intensity * facing * surfaceSpecular(s);
+  for (int i = 0; i < 2; i++) {
+    if (u_further_intensity[i] <= 0.0) continue;
+    s.toLight = u_further_to[i];
+    // the head as a ball: light from behind does not reach the front
+    float raised = dot(normalize(v_position - u_light_center), s.toLight);
+    float intensity = u_further_intensity[i] * smoothstep(-0.3, 0.1, raised);
+    irradiance += intensity * clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
+    float across = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
+    specular += PI * intensity * across * surfaceSpecular(s);
+  }
+  if (u_surrounded > 0.5) {
+    for (int c = 0; c < 3; c++) irradiance[c] += environmentIrradiance(s.diffuseNormals[c])[c];
+    specular += environmentHighlight(s);
+  }
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
-  float facing = lit * clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
-  o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s),
-    surfaceWidth(v_uv));
+  o_specular = vec4(s.intensity * specular, surfaceWidth(v_uv));
 }
 //@chunk inspect_fragment
 layout(location = 0) out vec4 o_inspect;

@@ -17,14 +17,14 @@ V.colorDefines = () => {
   return {C_M_MAX: c_m_max.toFixed(6), C_HD_MAX: c_hd_max.toFixed(6),
     TABLE_SIZE: V.scene.tables.skin_color.shape[0].toFixed(1)};
 };
-V.colorKey = p => [p.melanin_gain, p.hemoglobin_gain].join();
+V.colorKey = p => [p.person, p.melanin_gain, p.hemoglobin_gain].join();
 
 V.start.push(() => {
   if (V.scene.textures.facial_states) {
     const {width, height, layers} = V.scene.textures.facial_states;
     V.passes.push({
       name: "hemoglobin_rig", after: [],
-      key: p => V.stateWeights(p).join() + V.stateGain(p),
+      key: p => [p.person, ...V.stateWeights(p), V.stateGain(p)].join(),
       targets: () => ({hemoglobin_rig: {format: "RGBA32F", size: [width, height], space: "uv"}}),
       draw: ctx => ctx.full(V.program(["full_vertex"], ["hemoglobin_rig_fragment"],
         {STATES: layers}), {u_weights: V.stateWeights(ctx.p), u_gain: V.stateGain(ctx.p)}),

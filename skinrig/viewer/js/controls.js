@@ -9,6 +9,7 @@
 //   V.announce(text) writes to the live region; V.afterStart.push(fn) runs after the first frame.
 V.groups = [
   ["view", "View", "The final image, or a buffer of one render pass.", true],
+  ["people", "People", "Blood and melanin of several people on one head.", true],
   ["expression", "Expression", "Weights of the blend shapes; blood, wrinkles and strain follow.", true],
   ["blood", "Blood and melanin",
     "Blood is blended from maps of scale and bias. A table converts blood and melanin to color.", true],
@@ -16,7 +17,7 @@ V.groups = [
   ["scattering", "Scattering", "Subsurface scattering of light in the skin.", false],
   ["traits", "Traits", "Principal differences between the faces of a population.", false],
   ["relief", "Surface topography", "Pores, wrinkles and microstructure below the resolution of the mesh.", false],
-  ["light", "Light and tone", "One distant light, ambient light and tone mapping.", false],
+  ["light", "Light and tone", "Key, fill and rim light, environment, and tone mapping.", true],
   ["cost", "Resolution and cost", "Passes, texture reads, bytes and time per frame.", false],
   ["about", "About this face", "Provenance, errors, and omitted parts.", false],
 ];
@@ -141,8 +142,9 @@ V.updateControls = p => V.updates?.forEach(update => update(p));
 
 // Parameters of the view, not of the face: both sides of a comparison share them.
 V.SHARED = ["camera_yaw_deg", "camera_pitch_deg", "camera_distance_mm", "camera_fov_deg",
-  "camera_target_mm", "light_azimuth_deg", "light_elevation_deg", "light_intensity", "ambient",
-  "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads", "crowd",
+  "camera_target_mm", "light_azimuth_deg", "light_elevation_deg", "light_intensity", "ambient", "fill", "rim",
+  "environment", "environment_intensity", "environment_azimuth_deg", "timeline_s", "difference_gain",
+  "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads", "crowd", "gallery",
   "shadows", "shadow_px", "shadow_softness_mm"];
 
 // Internal parameters of passes.
@@ -153,6 +155,7 @@ V.faceOf = p => JSON.parse(JSON.stringify(Object.fromEntries(
 
 // Reset to the initial parameters; weights and traits added later are set to 0.
 V.reset = () => {
+  V.playing = false;
   const back = JSON.parse(JSON.stringify(V.initial));
   for (const name of ["weights", "traits"]) {
     for (const key of Object.keys(V.params[name])) back[name][key] ??= 0;

@@ -1,19 +1,21 @@
 // Several heads, each with its own expression: blood, wrinkles, strain, shadow and mesh are drawn
 // per head, and again only if its weights changed; screen passes are shared.
 //
-// The controls change the middle head. The others add the table's emotions and global conditions to
+// The controls change the middle head. Of a gallery, the others are the other people, with the same
+// weights. Else the others add the table's emotions and global conditions to
 // its weights. Microstructure is drawn at the center of the canvas; on the other heads all of its
 // slopes are in the roughness.
-Object.assign(V.defaults, {crowd: 1});
+Object.assign(V.defaults, {crowd: 1, gallery: 0});
 V.CROWD = ["happiness", "anger and surprise", "sad smile", "exercise", "surprise", "alcohol"];
 
-V.crowdOf = p => p.heads > 1 && p.crowd > 0.5;
+V.galleryOf = p => p.heads > 1 && p.gallery > 0.5;
+V.crowdOf = p => p.heads > 1 && (p.crowd > 0.5 || V.galleryOf(p));
 V.middleHead = p => Math.floor(0.5 * (p.heads - 1));
 
 // Weights that head i adds to those of the controls, with their label.
 V.crowdOffset = (p, i) => {
   const middle = V.middleHead(p);
-  if (!V.crowdOf(p) || i === middle) return {name: "", weights: {}};
+  if (!V.crowdOf(p) || V.galleryOf(p) || i === middle) return {name: "", weights: {}};
   const presets = V.scene.presets ?? {};
   const names = [...V.CROWD.filter(name => name in presets),
     ...Object.keys(presets).filter(name => name !== "neutral" && !V.CROWD.includes(name))];
@@ -25,12 +27,14 @@ V.crowdOffset = (p, i) => {
 // Parameters of head i; the middle head has the common ones.
 V.headParams = (p, i) => {
   if (!V.crowdOf(p) || i === V.middleHead(p)) return p;
+  const count = V.scene.facts.people?.length ?? 1;
+  const person = V.galleryOf(p) ? (p.person + i - V.middleHead(p) + count) % count : p.person;
   const weights = {...p.weights};
   for (const [name, weight] of Object.entries(V.crowdOffset(p, i).weights)) {
     weights[name] = Math.min((weights[name] ?? 0) + weight, 1.5);
   }
   const [full] = p.microstructure_variance;
-  return {...p, heads: 1, weights, microstructure_variance: [full, 0],
+  return {...p, heads: 1, person, weights, microstructure_variance: [full, 0],
     microstructure_place: [...p.microstructure_place.slice(0, 3), 0]};
 };
 

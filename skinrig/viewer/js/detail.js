@@ -8,14 +8,32 @@
 // omitting them, in radiance where 1 is a white surface. V.detail.state has this error; if it is below
 // the tolerance, they are omitted.
 Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
-V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}};
+V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}, found: new Map()};
 V.statistics.detail = V.detail.state;
 
-// Maximum derivative of diffuse and specular radiance by a slope, over normals and directions.
+// The same for all lights. Fill and rim light reach part of the face: their derivatives are RMS over the
+// visible normals of a ball, by projected area, in place of the maximum. The environment adds its diffuse part.
 V.detail.sensitivity = p => {
+  const key = V.detail.sensitivityOf(p);
+  const sum = {...key};
+  for (const {to: [x, y, z], intensity} of V.furtherLights(p)) {
+    if (!(intensity > 0)) continue;
+    const one = V.detail.sensitivityOf({...p, light_intensity: intensity,
+      light_azimuth_deg: Math.atan2(x, z) / V.RAD, light_elevation_deg: Math.asin(y) / V.RAD});
+    sum.diffuse += one.diffuseRms;
+    sum.specular += one.specularRms;
+  }
+  // irradiance over pi is at most the intensity, and falls off no faster than a cosine
+  if (V.surrounded(p)) sum.diffuse += p.environment_intensity * V.detail.ALBEDO;
+  return sum;
+};
+
+// Maximum derivative of diffuse and specular radiance by a slope, over normals and directions, for one light.
+V.detail.sensitivityOf = p => {
   const key = [p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.roughness,
     p.specular_intensity, p.f0, p.camera_yaw_deg, p.camera_pitch_deg].join();
-  if (V.detail.found?.key === key) return V.detail.found;
+  const known = V.detail.found.get(key);
+  if (known) return known;
   const l = V.direction(p.light_azimuth_deg, p.light_elevation_deg);
   const v = V.direction(p.camera_yaw_deg, p.camera_pitch_deg);
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -32,7 +50,7 @@ V.detail.sensitivity = p => {
     return strength * Math.max(dot(n, l), 0) * Math.exp((c2 - 1) / (c2 * m2))
       / (Math.PI * m2 * c2 * c2);
   };
-  let largest = 0;
+  let [largest, squares, lit, seen] = [0, 0, 0, 0];
   for (let i = 0; i < V.detail.NORMALS; i++) {
     const y = 1 - (2 * i + 1) / V.detail.NORMALS;
     const turn = i * Math.PI * (3 - Math.sqrt(5));
@@ -43,11 +61,19 @@ V.detail.sensitivity = p => {
     const step = 1e-3;
     const change = axis => (specular(unit(n.map((c, j) => c + step * axis[j])))
       - specular(unit(n.map((c, j) => c - step * axis[j])))) / (2 * step);
-    largest = Math.max(largest, Math.hypot(change(t), change(b)));
+    const found = Math.hypot(change(t), change(b));
+    largest = Math.max(largest, found);
+    squares += dot(n, v) * found ** 2;
+    lit += dot(n, v) * (dot(n, l) > 0);
+    seen += dot(n, v);
   }
   // the derivative of a cosine is at most 1
-  V.detail.found = {key, diffuse: p.light_intensity * V.detail.ALBEDO, specular: largest};
-  return V.detail.found;
+  if (V.detail.found.size > 8) V.detail.found.clear();
+  const diffuse = p.light_intensity * V.detail.ALBEDO;
+  const found = {diffuse, specular: largest, diffuseRms: diffuse * Math.sqrt(lit / seen),
+    specularRms: Math.sqrt(squares / seen)};
+  V.detail.found.set(key, found);
+  return found;
 };
 
 // Interpolate a list by level, linearly in the logarithm, as its entries decrease geometrically.

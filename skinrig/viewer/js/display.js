@@ -33,7 +33,7 @@ V.drawFrame = () => {
   V.use(V.program(["full_vertex"], ["show_fragment"]), V.sideA, p, {
     u_first: first.texture, u_second: second.texture, u_split: p.compare ? p.split : 2,
     u_low: plain ? 0 : p.view_low, u_high: plain ? 1 : p.view_high,
-    u_channels: V.FORMATS[first.format][2],
+    u_difference: p.compare ? p.difference_gain : 0, u_channels: V.FORMATS[first.format][2],
   });
   gl.bindVertexArray(V.vao);
   gl.drawArrays(gl.TRIANGLES, 0, 3);

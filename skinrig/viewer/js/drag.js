@@ -58,15 +58,16 @@ V.fitCanvas = () => {
   const port = document.getElementById("port");
   const [width, height] = [port.clientWidth, port.clientHeight];
   const {resolution} = V.params;
+  const moving = V.playing && V.software();
   const last = V.fitted;
   if (!width || !height) return false;
-  if (last && last.resolution === resolution && (last.width === width && last.height === height
+  if (last && last.resolution === resolution && last.moving === moving && (last.width === width && last.height === height
     || V.canvas.width !== last.size[0] || V.canvas.height !== last.size[1])) return false;
-  const most = resolution || (V.software() ? 448 : 1280);
+  const most = resolution || (moving ? 256 : V.software() ? 448 : 1280);
   const dense = resolution ? Infinity : window.devicePixelRatio || 1;
   const scale = Math.min(dense, most / Math.max(width, height));
   const size = [width, height].map(side => Math.max(16, Math.round(side * scale)));
-  V.fitted = {width, height, resolution, size};
+  V.fitted = {width, height, resolution, moving, size};
   if (V.canvas.width === size[0] && V.canvas.height === size[1]) return false;
   [V.canvas.width, V.canvas.height] = size;
   return true;
@@ -86,7 +87,7 @@ V.pixelAt = event => {
 };
 V.placeDivider = p => {
   const divider = document.getElementById("divider");
-  divider.hidden = !p.compare;
+  divider.hidden = !p.compare || p.difference_gain > 0 || p.split === 0 || p.split === 1;
   const {left, width} = V.shown();
   divider.style.left = `${left + p.split * width}px`;
 };

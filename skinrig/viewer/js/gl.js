@@ -136,11 +136,11 @@ V.use = (program, side, p, uniforms = {}) => {
       V.setUniform(info, Number.isFinite(p[rest]) || Array.isArray(p[rest]) ? p[rest]
         : Number(p[rest]));
     } else if (name.startsWith("t_") && name.endsWith("_low")) {
-      V.setUniform(info, V.textureOf(rest.slice(0, -4)).low);
+      V.setUniform(info, V.textureOfPerson(rest.slice(0, -4), p).low);
     } else if (name.startsWith("t_") && name.endsWith("_span")) {
-      V.setUniform(info, V.textureOf(rest.slice(0, -5)).span);
+      V.setUniform(info, V.textureOfPerson(rest.slice(0, -5), p).span);
     } else if (name.startsWith("t_")) {
-      const texture = V.textureOf(rest);
+      const texture = V.textureOfPerson(rest, p);
       bind(info, texture.handle, texture.target);
     } else if (name.startsWith("l_")) {
       bind(info, V.tableOf(rest));
@@ -196,6 +196,13 @@ V.newTexture = (format, size, {data = null, filter = "linear", mip = false, laye
 };
 
 V.zeroTexture = () => (V.zero ??= V.newTexture("RGBA8", [1, 1], {data: new Uint8Array(4)}));
+
+// Textures of person k > 0 are named NAME_person_k; others are shared by all people.
+Object.assign(V.defaults, {person: 0});
+V.textureOfPerson = (name, p) => {
+  const own = `${name}_person_${p.person}`;
+  return V.textureOf(own in V.scene.textures ? own : name);
+};
 
 // A scene texture on the device; 16-bit words become floats, since WebGL2 has no such format.
 V.uploads = new Map();

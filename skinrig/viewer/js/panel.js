@@ -47,6 +47,26 @@ V.registerView = () => V.controls.push(
   {group: "view", kind: "own", build: V.buildComparison},
 );
 
+V.registerPeople = () => {
+  const people = V.scene.facts.people ?? [];
+  if (people.length < 2) return;
+  V.controls.push(
+    {group: "people", kind: "choice", path: ["person"], label: "Person",
+      options: () => people.map((name, i) => [i, `Phototype ${name}`]), off: p => p.gallery && p.heads > 1},
+    {group: "people", kind: "own", build: box => {
+      const all = V.element("button", {type: "button", "aria-pressed": "false"}, "Side by side");
+      all.onclick = () => {
+        const on = !(V.params.gallery && V.params.heads > 1);
+        V.set(on ? {gallery: 1, person: (people.length - 1) >> 1, heads: people.length, ...V.framed(people.length)}
+          : {gallery: 0, person: 0, heads: 1, camera_distance_mm: V.initial.camera_distance_mm});
+        V.announce(on ? `Phototypes ${people.join(", ")} side by side` : "One person");
+      };
+      box.append(V.element("div", {className: "buttons"}, all));
+      return p => all.setAttribute("aria-pressed", String(p.gallery > 0.5 && p.heads > 1));
+    }},
+  );
+};
+
 V.registerSize = () => V.controls.push(
   {group: "cost", kind: "choice", path: ["heads"], label: "Heads",
     help: "Jimenez et al. (2010) measure speed with five heads.",
@@ -61,7 +81,8 @@ V.registerSize = () => V.controls.push(
 );
 
 V.registerExpression = () => {
-  V.controls.push({group: "expression", kind: "own", build: V.buildPresets});
+  V.controls.push({group: "expression", kind: "own", build: V.buildPresets},
+    {group: "expression", kind: "own", build: V.buildTimeline, when: () => V.timelineKeys().length > 1});
   for (const name of V.weightNames().filter(one => !V.globalStates().includes(one))) {
     V.controls.push({group: "expression", kind: "range", path: ["weights", name], min: 0, max: 1.5,
       label: V.capital(V.words(name)), show: V.percent});
@@ -173,13 +194,26 @@ V.registerRelief = () => V.controls.push(
 );
 
 V.registerLight = () => V.controls.push(
+  {group: "light", kind: "own", build: V.buildLightings},
   {group: "light", kind: "range", path: ["light_azimuth_deg"], min: -180, max: 180, step: 1,
     label: "Light azimuth", show: V.degrees, help: "Also by dragging with the tool Light."},
   {group: "light", kind: "range", path: ["light_elevation_deg"], min: -89, max: 89, step: 1,
     label: "Light elevation", show: V.degrees},
   {group: "light", kind: "range", path: ["light_intensity"], min: 0, max: 10, step: 0.1, label: "Light intensity"},
+  {group: "light", kind: "range", path: ["fill"], min: 0, max: 1, label: "Fill light", show: V.percent,
+    help: "Fraction of the key light, from its other side."},
+  {group: "light", kind: "range", path: ["rim"], min: 0, max: 2, label: "Rim light", show: V.percent,
+    help: "Fraction of the key light, from behind."},
+  {group: "light", kind: "choice", path: ["environment"], label: "Environment",
+    help: "Light from all directions, by spherical harmonics up to band 2; without shadows.",
+    options: () => [["none", "None"], ["overcast", "Overcast sky"], ["window", "Room with a window"],
+      ["uniform", "Integrating sphere"]]},
+  {group: "light", kind: "range", path: ["environment_intensity"], min: 0, max: 3, zero: 1, label: "Environment intensity",
+    off: p => p.environment === "none", help: "Irradiance over π of the brightest direction, at most."},
+  {group: "light", kind: "range", path: ["environment_azimuth_deg"], min: -180, max: 180, step: 1,
+    label: "Environment rotation", show: V.degrees, off: p => p.environment === "none"},
   {group: "light", kind: "toggle", path: ["shadows"], label: "Shadows",
-    help: "Shadows of the head on itself, from one depth map."},
+    help: "Shadows of the head on itself from the key light, from one depth map."},
   {group: "light", kind: "range", path: ["shadow_softness_mm"], min: 0, max: 8, step: 0.1, label: "Shadow softness",
     zero: 0, show: v => `${v.toFixed(1)} mm`, off: p => !p.shadows},
   {group: "light", kind: "range", path: ["ambient"], min: 0, max: 1, label: "Ambient light"},
@@ -198,6 +232,7 @@ V.buildPresets = box => {
     const button = V.element("button", {type: "button", "aria-pressed": "false"}, V.capital(name));
     button.onclick = () => {
       const weights = Object.fromEntries(V.weightNames().map(one => [one, preset.weights?.[one] ?? 0]));
+      V.playing = false;
       V.set({...preset, weights});
       V.announce(`Expression: ${name}`);
     };
@@ -207,41 +242,32 @@ V.buildPresets = box => {
   box.append(buttons);
   return p => made.forEach(([button, weights]) => button.setAttribute("aria-pressed", same(p, weights)));
 };
+// Lights of the whole scene, one button each.
+V.LIGHTINGS = {
+  "Key light": {light_intensity: 3.2, ambient: 0.12, fill: 0, rim: 0, environment: "none"},
+  "Three-point": {light_intensity: 2.2, ambient: 0.12, fill: 0.3, rim: 0.3, environment: "none"},
+  "Overcast sky": {light_intensity: 0, ambient: 0, fill: 0, rim: 0, environment: "overcast", environment_intensity: 2.4},
+  "Room with a window": {light_intensity: 0, ambient: 0, fill: 0, rim: 0, environment: "window", environment_intensity: 2.4},
+};
+V.buildLightings = box => {
+  const buttons = V.element("div", {className: "buttons", role: "group", "aria-label": "Lightings"});
+  const made = Object.entries(V.LIGHTINGS).map(([name, lighting]) => {
+    const button = V.element("button", {type: "button", "aria-pressed": "false"}, name);
+    button.onclick = () => { V.set(lighting); V.announce(`Light: ${name}`); };
+    buttons.append(button);
+    return [button, lighting];
+  });
+  box.append(buttons);
+  return p => made.forEach(([button, lighting]) => button.setAttribute("aria-pressed",
+    Object.entries(lighting).every(([key, value]) => p[key] === value)));
+};
+
 // Presets are packed without order; the neutral face is listed first.
 V.presetsInOrder = () => {
   const order = ["neutral", "happiness", "sadness", "surprise", "fear", "anger", "disgust", "smile", "sad smile",
     "anger and surprise", "exercise", "after exercise", "alcohol"];
   const rank = name => (order.indexOf(name) + 1 || order.length + 1);
   return Object.fromEntries(Object.entries(V.scene.presets ?? {}).sort(([a], [b]) => rank(a) - rank(b)));
-};
-
-// Comparison of two sets of parameters side by side.
-V.buildComparison = box => {
-  const keep = V.element("button", {type: "button"}, "Store as B");
-  const swap = V.element("button", {type: "button"}, "Swap A and B");
-  const end = V.element("button", {type: "button"}, "End");
-  const slider = V.buildControl({kind: "range", path: ["split"], min: 0, max: 1, zero: 0, label: "Divider",
-    show: V.percent}, "split");
-  keep.onclick = () => {
-    V.set({compare: V.faceOf(V.params)});
-    V.announce("B keeps the current settings; controls change A, left of the divider.");
-  };
-  swap.onclick = () => {
-    const held = V.params.compare;
-    V.set({...held, compare: V.faceOf(V.params)});
-    V.announce("A and B are swapped.");
-  };
-  end.onclick = () => { V.set({compare: null}); V.announce("Comparison ended."); keep.focus(); };
-  box.append(V.element("p", {className: "label"}, "Compare A with B"),
-    V.element("div", {className: "buttons"}, keep, swap, end), slider.box,
-    V.element("p", {className: "help"}, "Controls change A, left of the divider. B is fixed."));
-  return p => {
-    slider.update(p);
-    slider.box.hidden = swap.hidden = end.hidden = !p.compare;
-    const port = document.getElementById("port");
-    for (const badge of port.querySelectorAll(".badge")) badge.hidden = !p.compare;
-    V.placeDivider(p);
-  };
 };
 
 V.describeScene = () => {
@@ -275,6 +301,6 @@ V.describeScene = () => {
     leftOut.forEach(([what, why]) => add(`Omitted: ${what}`, why));
     box.append(list);
   }});
-  [V.registerView, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,
+  [V.registerView, V.registerPeople, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,
     V.registerTraits, V.registerRelief, V.registerLight, V.registerSize].forEach(register => register());
 };

@@ -16,7 +16,8 @@ V.surface = {
   specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig", "albedo_traits"], keys: [],
 };
 
-V.surfaceDefines = () => ({PI: "3.14159265358979", ...V.colorDefines(), ...V.surface.defines});
+V.surfaceDefines = () => ({PI: "3.14159265358979", LEAST_TABLE_M: V.LEAST_TABLE_M.toFixed(4),
+  MOST_TABLE_M: V.MOST_TABLE_M.toFixed(4), ...V.colorDefines(), ...V.surface.defines});
 
 // Functions that combine the hooks.
 V.surfaceJoin = p => {
@@ -58,7 +59,7 @@ V.drawHeads = (ctx, program, uniforms) => {
   });
 };
 
-V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads, p.crowd].join();
+V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
 V.screen = () => [V.canvas.width, V.canvas.height];
 
 V.start.push(() => {
@@ -66,8 +67,7 @@ V.start.push(() => {
     name: "surface",
     get after() { return V.surface.after; },
     depth: true,
-    key: p => [V.meshKey(p), V.colorKey(p), p.light_azimuth_deg, p.light_elevation_deg,
-      p.light_intensity, p.ambient, p.roughness, p.specular_intensity, p.relief, p.f0,
+    key: p => [V.meshKey(p), V.colorKey(p), V.lightsKey(p), p.ambient, p.roughness, p.specular_intensity, p.relief, p.f0,
       p.specular_model, ...V.surface.keys.map(f => f(p))].join(),
     targets: () => ({
       irradiance: {format: "RGBA32F", size: V.screen(), space: "screen", filter: "nearest"},
@@ -77,11 +77,10 @@ V.start.push(() => {
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
       const program = V.program(["mesh_attributes", "mesh_vertex"], ["surface_varyings",
-        "surface_point", "skin_color", "kelemen_specular", "shadow_lookup",
+        "surface_point", "skin_color", "kelemen_specular", "environment_light", "shadow_lookup",
         ...V.surface.chunks,
         V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
-      V.drawHeads(ctx, program,
-        {u_to_light: V.direction(ctx.p.light_azimuth_deg, ctx.p.light_elevation_deg)});
+      V.drawHeads(ctx, program, V.lightUniforms(ctx.p));
     },
     cost: p => ({taps: (8 + 25 * V.shadowed(p)) * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
   });

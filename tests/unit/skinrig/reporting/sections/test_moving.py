@@ -1,9 +1,11 @@
 """The report's sections on faces that move and on sequences in time."""
 
 import json
+import re
 from html import unescape
 
 import numpy as np
+import pytest
 
 from model import store
 from model.facial_color import document as facial_color_document
@@ -72,6 +74,14 @@ def test_rig_with_true_blood_passes_limit_other_misses(tmp_path):
     assert "Moving face: moving" in page
     assert "The only check kept its limit." in page
     assert "blood volume fraction of smile, by the rig" in page
+    change = "change of the blood volume fraction from neutral to smile"
+    medians = {
+        label: re.search(rf"{change}, {label}: median ([0-9.e-]+)", page)[1]
+        for label in ("ground truth", "estimate")
+    }
+    assert medians["ground truth"] == medians["estimate"]
+    assert float(medians["estimate"]) == pytest.approx(0.5 * np.median(neutral), rel=0.02)
+    assert "smile, change × 4" in page
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 2.5 * neutral)
     assert "1 of 1 checks missed its limit." in report.build([tmp_path])
 
