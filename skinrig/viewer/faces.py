@@ -22,6 +22,7 @@ from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
+from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
@@ -109,6 +110,7 @@ ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
     fitted_assets.build_assets,
     wrinkle_assets.build_assets,
     microstructure_assets.build_assets,
+    face_part_assets.build_assets,
 )
 """Builders of the page's assets, in the order of its parts; they are independent."""
 
