@@ -76,6 +76,8 @@ class Eyelids:
         and the last ones are beside the corners, where the lids stay closed.
     faces
         Indices of the triangles between the margins, omitted while the eye is open, shape (A,).
+    edges
+        Triangles that are added then, shape (B, 3): where the margin steps from row to row.
     """
 
     center_mm: Float64Array
@@ -85,6 +87,7 @@ class Eyelids:
     upper: Int64Array
     lower: Int64Array
     faces: Int64Array
+    edges: Int64Array
 
     def displacement_mm(self, weight: float) -> Float64Array:
         """Return the displacement of `vertices` at a weight from 0 (closed), shape (N, 3)."""
@@ -103,8 +106,8 @@ def grid_shape(mesh: Mesh) -> tuple[int, int] | None:
     if columns < 2 or len(mesh.uv) % columns:
         return None
     grid = mesh.uv.reshape(-1, columns, 2)
-    regular = np.ptp(grid[..., 1], axis=1).max() == 0.0 and np.ptp(grid[..., 0], axis=0).max() == 0.0
-    return (len(grid), columns) if regular else None
+    uneven = max(float(np.ptp(grid[..., 1 - k], axis=1 - k).max()) for k in (0, 1))
+    return (len(grid), columns) if uneven == 0.0 else None
 
 
 def build_eyelids(mesh: Mesh) -> tuple[Eyelids, Eyelids]:
@@ -168,21 +171,43 @@ def _build_one(mesh: Mesh, shape: tuple[int, int], side: float) -> Eyelids:
         arc[used] * mirror,
         index[first[ends_too], ends_too],
         index[first[ends_too] - 1, ends_too],
-        _between(mesh, index, above, near, opened),
+        *_between(mesh, shape, index, above, near, opened),
     )
 
 
 def _between(
-    mesh: Mesh, index: Int64Array, above: BoolArray, near: BoolArray, opened: Int64Array
-) -> Int64Array:
-    """Return the triangles with vertices of both lids and one in an opened column."""
+    mesh: Mesh,
+    shape: tuple[int, int],
+    index: Int64Array,
+    above: BoolArray,
+    near: BoolArray,
+    opened: Int64Array,
+) -> tuple[Int64Array, Int64Array]:
+    """Return the triangles with vertices of both lids and one in an opened column.
+
+    Where both triangles of a quad are such and three of its corners are of one lid, these three
+    are a triangle of that lid.
+    """
     label = np.zeros(len(mesh.vertices_mm), np.int64)
     label[index[near]] = np.where(above[near], 1, 2)
     inside = np.zeros(len(mesh.vertices_mm), bool)
     inside[index[:, opened]] = True
     of = label[mesh.faces]
     mixed = (of == 1).any(axis=1) & (of == 2).any(axis=1) & inside[mesh.faces].any(axis=1)
-    return np.flatnonzero(mixed)
+    grid = np.arange(shape[0] * shape[1]).reshape(shape)
+    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1)
+    quads = quads.reshape(-1, 4)
+    odd = [
+        (label[quads[:, k]] == one) & (label[np.delete(quads, k, axis=1)] == 3 - one).all(axis=1)
+        for one in (1, 2)
+        for k in (0, 2)  # the corners on the diagonal
+    ]
+    inner = inside[quads].any(axis=1)
+    added = [
+        np.delete(quads[found & inner], k, axis=1)
+        for found, k in zip(odd, (0, 2, 0, 2), strict=True)
+    ]
+    return np.flatnonzero(mixed), np.concatenate(added)
 
 
 def _lid_line(x: Float64Array) -> Float64Array:

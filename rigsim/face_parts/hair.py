@@ -36,9 +36,9 @@ BROW_HAIRS: Final = 230
 UPPER_LASHES: Final = 90
 LOWER_LASHES: Final = 45
 """Number of hairs per brow and lashes per lid; people have 90 to 160 and 75 to 80."""
-SCALP_LOCKS: Final = 3000
+SCALP_LOCKS: Final = 4200
 """Number of locks on the scalp; a lock stands for about 20 hairs."""
-WIDTH_MM: Final = {"brow": 0.16, "lash": 0.13, "scalp": 1.1}
+WIDTH_MM: Final = {"brow": 0.16, "lash": 0.13, "scalp": 1.0}
 """Width of a curve at its root: a brow hair, a lash, a lock."""
 
 
@@ -146,8 +146,8 @@ def _brow(
     y = center + half * offset
     vertices = mesh.vertices_mm.astype(np.float64) * (side, 1.0, 1.0)
     front = np.flatnonzero((vertices[:, 2] > -55.0) & (vertices[:, 0] > 0.0))
-    off = (vertices[front, 0][None] - x[:, None]) ** 2 + (vertices[front, 1][None] - y[:, None]) ** 2
-    roots = front[np.argmin(off, axis=1)]
+    off = vertices[front, None, :2] - np.stack([x, y], axis=-1)
+    roots = front[np.argmin(np.sum(off**2, axis=-1), axis=0)]
     normal = mesh.normals[roots].astype(np.float64) * (side, 1.0, 1.0)
     # z on the tangent plane of the nearest vertex
     at = vertices[roots]
@@ -216,7 +216,9 @@ def _hairline(points: Float64Array) -> Float64Array:
     temple = np.minimum(-(z + 52.0), y - 22.0)
     burns = np.minimum(-(z + 66.0), y - 2.0)
     behind = np.minimum(-(z + 98.0), y + 28.0)
-    return np.maximum.reduce([np.minimum(front, -(z + 8.0)), temple, burns, behind])
+    scalp = np.maximum.reduce([np.minimum(front, -(z + 8.0)), temple, burns, behind])
+    ear = np.sqrt(((y - 10.0) / 31.0) ** 2 + ((z + 84.0) / 19.0) ** 2) - 1.0
+    return np.where(across > 50.0, np.minimum(scalp, 20.0 * ear), scalp)
 
 
 def _scalp(mesh: Mesh, rng: np.random.Generator) -> tuple[Float64Array, Int64Array]:

@@ -21,7 +21,7 @@ EXPRESSION_OPENING: Final = {
 """Change of the lids' opening in each expression: action units 5, 6 and 7 of the facial action
 coding system (Ekman and Friesen 1978)."""
 
-_IRIS_COLORS: Final = ((0.15, 0.21, 0.26), (0.14, 0.10, 0.045), (0.055, 0.028, 0.013))
+_IRIS_COLORS: Final = ((0.095, 0.14, 0.17), (0.10, 0.07, 0.032), (0.03, 0.015, 0.008))
 """Linear sRGB albedo of blue, hazel and dark brown irises."""
 _AZIMUTHAL_ROUGHNESS: Final = 0.3
 """Azimuthal roughness of hair, Chiang et al. 2016."""
@@ -45,6 +45,7 @@ def build_assets(source: SceneSource) -> Assets:
             f"lid_moves_{name}": _quantized(moves, LID_STEPS_PER_MM),
             f"lid_margins_{name}": np.stack([lids.upper, lids.lower], axis=1).astype(np.uint32),
             f"lid_faces_{name}": lids.faces.astype(np.uint32)[:, None],
+            f"lid_edges_{name}": lids.edges.astype(np.uint32),
         }
         eyes.append({"name": name, "center_mm": lids.center_mm.tolist()})
     at = source.mesh.vertices_mm[hair.roots].astype(np.float64)
