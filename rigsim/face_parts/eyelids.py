@@ -275,7 +275,11 @@ def _smooth(t: Float64Array) -> Float64Array:
 
 
 def _front(
-    x: Float64Array, y: Float64Array, center: Float64Array, ends: Float64Array, radius: float,
+    x: Float64Array,
+    y: Float64Array,
+    center: Float64Array,
+    ends: Float64Array,
+    radius: float,
     behind: float,
 ) -> Float64Array:
     """Return z of a sphere around the eyeball, joined smoothly to the sheet between the corners."""

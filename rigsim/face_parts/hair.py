@@ -23,13 +23,24 @@ radius; d'Eon et al. 2011, as used by Chiang et al. 2016 (doi 10.1111/cgf.12830)
 PHEOMELANIN_PER_RADIUS: Final = (0.187, 0.4, 1.05)
 """Absorption of pheomelanin, same source and unit."""
 _EUMELANIN: Final = {
-    "I": (0.25, 0.8), "II": (0.5, 1.4), "III": (1.1, 2.6), "IV": (2.5, 5.0), "V": (5.0, 8.0),
+    "palest": (0.15, 0.4),
+    "I": (0.25, 0.8),
+    "II": (0.5, 1.4),
+    "III": (1.1, 2.6),
+    "IV": (2.5, 5.0),
+    "V": (5.0, 8.0),
     "VI": (7.0, 9.0),
+    "darkest": (8.0, 10.0),
 }
-"""Range of eumelanin by phototype; Chiang et al. 2016: 0.3 blond, 1.3 brown, 8 black."""
-_PHEOMELANIN: Final = {"I": (0.1, 0.9), "II": (0.1, 0.4)}
-"""Range of pheomelanin; other phototypes have 0.05."""
-_IRIS_EUMELANIN: Final = {"I": (0.0, 0.25), "II": (0.0, 0.5), "III": (0.25, 0.8)}
+"""Range of eumelanin by preset of the skin; Chiang et al. 2016: 0.3 blond, 1.3 brown, 8 black."""
+_PHEOMELANIN: Final = {"palest": (0.1, 0.9), "I": (0.1, 0.9), "II": (0.1, 0.4)}
+"""Range of pheomelanin; other presets have 0.05."""
+_IRIS_EUMELANIN: Final = {
+    "palest": (0.0, 0.1),
+    "I": (0.0, 0.25),
+    "II": (0.0, 0.5),
+    "III": (0.25, 0.8),
+}
 """Range of the iris' melanin from 0 (blue) to 1 (dark brown); others have 0.85 to 1."""
 
 BROW_HAIRS: Final = 230
@@ -80,15 +91,15 @@ class Hair:
         return np.asarray(eumelanin + self.pheomelanin * np.array(PHEOMELANIN_PER_RADIUS))
 
 
-def draw_hair(mesh: Mesh, phototype: str, *, seed: int) -> Hair:
+def draw_hair(mesh: Mesh, preset: str, *, seed: int) -> Hair:
     """Draw the hair of a person.
 
     Parameters
     ----------
     mesh
         Head of `rigsim.subject.head.build_head` at rest, mm, rig frame.
-    phototype
-        One of I to VI; it sets the range of the melanins.
+    preset
+        One of `rigsim.subject.PRESET_NAMES`; it sets the range of the melanins.
     seed
         Seed of the person, >= 0.
 
@@ -96,12 +107,14 @@ def draw_hair(mesh: Mesh, phototype: str, *, seed: int) -> Hair:
     ------
     rigsim.face_parts.eyelids.EyelidError
         The mesh is another one.
+    KeyError
+        The preset is unknown.
     """
     rng = np.random.default_rng([seed, 40])
     lids = build_eyelids(mesh)
-    eumelanin = rng.uniform(*_EUMELANIN.get(phototype, (1.1, 2.6)))
-    pheomelanin = rng.uniform(*_PHEOMELANIN.get(phototype, (0.05, 0.05)))
-    iris = rng.uniform(*_IRIS_EUMELANIN.get(phototype, (0.85, 1.0)))
+    eumelanin = rng.uniform(*_EUMELANIN[preset])
+    pheomelanin = rng.uniform(*_PHEOMELANIN.get(preset, (0.05, 0.05)))
+    iris = rng.uniform(*_IRIS_EUMELANIN.get(preset, (0.85, 1.0)))
     brows = [_brow(mesh, side, rng) for side in (1.0, -1.0)]
     lashes = [_lashes(mesh, one, rng) for one in lids]
     scalp, scalp_roots = _scalp(mesh, rng)
@@ -136,9 +149,7 @@ def _brow_line(x: Float64Array) -> tuple[Float64Array, Float64Array]:
     return center, 3.3 * (1.0 - 0.72 * share)
 
 
-def _brow(
-    mesh: Mesh, side: float, rng: np.random.Generator
-) -> tuple[Float64Array, Int64Array]:
+def _brow(mesh: Mesh, side: float, rng: np.random.Generator) -> tuple[Float64Array, Int64Array]:
     share = rng.uniform(0.0, 1.0, BROW_HAIRS) ** 0.9
     x = 13.0 + 38.0 * share
     center, half = _brow_line(x)
@@ -233,9 +244,7 @@ def _scalp(mesh: Mesh, rng: np.random.Generator) -> tuple[Float64Array, Int64Arr
     r, s = np.where(swap, 1.0 - r, r), np.where(swap, 1.0 - s, s)
     part = np.stack([1.0 - r - s, r, s], axis=-1)
     root = np.einsum("sk,skc->sc", part, corners[face])
-    normal = _unit(
-        np.einsum("sk,skc->sc", part, mesh.normals[mesh.faces[face]].astype(np.float64))
-    )
+    normal = _unit(np.einsum("sk,skc->sc", part, mesh.normals[mesh.faces[face]].astype(np.float64)))
     kept = _hairline(root) > 2.0 * np.abs(rng.standard_normal(SCALP_LOCKS)) - 1.0
     root, normal, face, part = root[kept], normal[kept], face[kept], part[kept]
     count = len(root)

@@ -20,9 +20,9 @@ from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
-from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin

@@ -16,7 +16,8 @@ from skinrig.viewer.scene import SceneError, ViewerScene
 
 SCRIPT_NAMES: Final = (
     "graph gl load mesh camera color shading shadow crowd eyes hair strain wrinkles detail "
-    "microstructure tiles scattering reflectance display costs probes drag address panel controls main"
+    "microstructure tiles scattering reflectance display costs probes drag address panel "
+    "controls main"
 ).split()
 """Scripts in the order in which they run, all in one function; `main.js` comes last."""
 

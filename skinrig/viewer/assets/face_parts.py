@@ -15,8 +15,13 @@ HAIR_STEPS_PER_MM: Final = 64.0
 """Quantization of displacements of the lids, and of curves relative to their roots."""
 
 EXPRESSION_OPENING: Final = {
-    "surprise": 0.14, "fear": 0.12, "anger": -0.1, "disgust": -0.25, "happiness": -0.18,
-    "smile": -0.1, "sadness": -0.15,
+    "surprise": 0.14,
+    "fear": 0.12,
+    "anger": -0.1,
+    "disgust": -0.25,
+    "happiness": -0.18,
+    "smile": -0.1,
+    "sadness": -0.15,
 }
 """Change of the lids' opening in each expression: action units 5, 6 and 7 of the facial action
 coding system (Ekman and Friesen 1978)."""
@@ -33,7 +38,7 @@ def build_assets(source: SceneSource) -> Assets:
     Meshes other than the simulated head keep their own geometry and have none.
     """
     rest = source.subject if source.subject.rest is None else source.subject.rest
-    if source.mesh is None or eyelids.grid_shape(source.mesh) is None:
+    if source.kind == "mesh" or eyelids.grid_shape(source.mesh) is None:
         return Assets(left_out=(("eyes and hair", "only the simulated head has them"),))
     hair = draw_hair(source.mesh, rest.preset, seed=source.seed)
     tables: dict[str, NDArray[Any]] = {}
