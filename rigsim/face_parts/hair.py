@@ -277,7 +277,7 @@ def _coverage(mesh: Mesh) -> Float32Array:
     center, half = _brow_line(np.abs(points[:, 0]))
     inside = (np.abs(points[:, 0]) - 12.0) / 2.0, (52.0 - np.abs(points[:, 0])) / 4.0
     soft = np.prod([1.0 / (1.0 + np.exp(-2.0 * one)) for one in inside], axis=0)
-    brow = 0.34 * soft * np.exp(-(((points[:, 1] - center) / (0.9 * half)) ** 2))
+    brow = 0.45 * soft * np.exp(-(((points[:, 1] - center) / (0.9 * half)) ** 2))
     brow *= points[:, 2] > -55.0
     covered = np.maximum(scalp, brow)
     return np.where(covered < 0.01, 0.0, covered).astype(np.float32)

@@ -142,7 +142,7 @@ void main() {
   vec3 normal = normalize(v_normal);
   float facing = clamp((dot(normal, u_to_light) + 0.35) / 1.35, 0.0, 1.0);
   // hair around a strand hides its root
-  float depth_shade = lock ? mix(0.25, 1.0, smoothstep(0.0, 0.8, v_fiber.y)) : 1.0;
+  float depth_shade = lock ? mix(0.25, 1.0, smoothstep(0.0, 0.8, v_fiber.y)) : 0.55;
   vec3 diffuse = (u_multiple + 0.15 * inside * inside * inside) * cos_i;
   vec3 light = p_light_intensity * v_lit * facing * depth_shade * (PI * direct * cos_i + diffuse)
     + p_ambient * depth_shade * (0.6 + 0.4 * normal.y) * (u_multiple + 0.15 * inside * inside * inside);
