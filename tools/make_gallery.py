@@ -223,7 +223,10 @@ def screenshots(demo: Path) -> None:
     except ImportError:
         chromium = None
     if chromium is None:
-        print("viewer.png, gallery-people.png, report.png: not made, run `make browser` first", file=sys.stderr)
+        print(
+            "viewer.png, gallery-people.png, report.png: not made, run `make browser` first",
+            file=sys.stderr,
+        )
         return
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         live = Path(name) / "face.html"

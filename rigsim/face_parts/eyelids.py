@@ -73,7 +73,7 @@ class Eyelids:
         the lids around the eyeball.
     upper, lower
         Indices of the margins' vertices from the inner to the outer corner, shape (M,); the first
-        and the last ones are beside the corners, where the lids stay closed.
+        and the last ones are outside of the corners, where the lids stay closed.
     faces
         Indices of the triangles between the margins, omitted while the eye is open, shape (A,).
     edges

@@ -1,7 +1,7 @@
 """Draw brows, lashes and hair of the scalp as curves, seeded for each person.
 
-Hair is no skin: no map of the skin has it, and it leaves the skin's mesh as it is. A curve has
-`POINTS` points from the root to the tip and follows the mesh's vertex at its root.
+Hair is not skin: no map of the skin has it, and it leaves the skin's mesh as it is. A curve has
+`CURVE_POINTS` points from the root to the tip and follows the mesh's vertex at its root.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from rigsim.arrays import Float32Array, Float64Array, Int64Array
 from rigsim.face_parts.eyelids import Eyelids, build_eyelids
 from rigsim.geometry.mesh import Mesh
 
-POINTS: Final = 5
+CURVE_POINTS: Final = 5
 """Points of each curve."""
-KINDS: Final = ("brow", "lash", "scalp")
+HAIR_KINDS: Final = ("brow", "lash", "scalp")
 
 EUMELANIN_PER_RADIUS: Final = (0.419, 0.697, 1.37)
 """Absorption of eumelanin in red, green and blue per unit of concentration, 1 over the fiber's
@@ -48,7 +48,7 @@ UPPER_LASHES: Final = 90
 LOWER_LASHES: Final = 45
 """Number of hairs per brow and lashes per lid; people have 90 to 160 and 75 to 80."""
 SCALP_LOCKS: Final = 4200
-"""Number of locks on the scalp; a lock stands for about 20 hairs."""
+"""Number of locks on the scalp; a lock represents about 20 hairs."""
 WIDTH_MM: Final = {"brow": 0.16, "lash": 0.13, "scalp": 1.0}
 """Width of a curve at its root: a brow hair, a lash, a lock."""
 
@@ -60,14 +60,14 @@ class Hair:
     Attributes
     ----------
     points_mm
-        Curves, shape (S, `POINTS`, 3), rig frame, eyes closed; brows, then lashes, then scalp.
+        Curves, shape (S, `CURVE_POINTS`, 3), rig frame, eyes closed; brows, then lashes, then scalp.
     opening_mm
         Displacement of the lashes relative to their roots when the eyes are open, shape
-        (L, `POINTS`, 3).
+        (L, `CURVE_POINTS`, 3).
     roots
         Vertex of the mesh that each curve follows, shape (S,).
     counts
-        Number of curves of each of `KINDS`.
+        Number of curves of each of `HAIR_KINDS`.
     coverage
         Fraction of the skin that hair covers at each vertex of the mesh, shape (V,).
     eumelanin, pheomelanin
@@ -134,7 +134,7 @@ def draw_hair(mesh: Mesh, preset: str, *, seed: int) -> Hair:
 
 
 def _along() -> Float64Array:
-    return np.linspace(0.0, 1.0, POINTS)[:, None]
+    return np.linspace(0.0, 1.0, CURVE_POINTS)[:, None]
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

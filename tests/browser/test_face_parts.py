@@ -1,4 +1,4 @@
-"""Eyes, brows, lashes and hair of the simulated head, which are no skin."""
+"""Eyes, brows, lashes and hair of the simulated head, which are not skin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Build the page's eyes and hair, which are no skin, on the simulated head."""
+"""Build the page's eyes and hair, which are not skin, on the simulated head."""
 
 from typing import Any, Final
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.face_parts import eyelids
-from rigsim.face_parts.hair import KINDS, WIDTH_MM, Hair, draw_hair
+from rigsim.face_parts.hair import HAIR_KINDS, WIDTH_MM, Hair, draw_hair
 from skinrig.arrays import FloatArray
 from skinrig.viewer.scene import Assets, SceneSource
 
@@ -66,7 +66,7 @@ def build_assets(source: SceneSource) -> Assets:
     facts = {
         "lid_steps_per_mm": LID_STEPS_PER_MM,
         "hair_steps_per_mm": HAIR_STEPS_PER_MM,
-        "counts": dict(zip(KINDS, hair.counts, strict=True)),
+        "counts": dict(zip(HAIR_KINDS, hair.counts, strict=True)),
         "width_mm": WIDTH_MM,
         "absorption": hair.absorption_per_radius().tolist(),
         "multiple_scattering": _multiple_scattering(hair).tolist(),

@@ -104,7 +104,7 @@ void main() {
   o_specular = vec4(vec3(min(bright, 6.0)), 0.12);
 }
 //@chunk eye_inspect_fragment
-// No skin: no texture coordinates, no chromophores.
+// Not skin: no texture coordinates, no chromophores.
 in float v_depth;
 layout(location = 0) out vec4 o_inspect;
 layout(location = 1) out vec4 o_normal;

@@ -1,4 +1,4 @@
-// Eyes of the simulated head, which are no skin: lids that open around the eyeballs, and what is seen
+// Eyes of the simulated head, which are not skin: lids that open around the eyeballs, and what is seen
 // between them. A ray is traced through the cornea to the iris per pixel.
 //
 //   V.lids         null, or the tables of both eyes; rigsim/face_parts/eyelids.py defines them

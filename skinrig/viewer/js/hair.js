@@ -1,4 +1,4 @@
-// Hair of the simulated head, which is no skin: ribbons that face the camera, blended from far to near
+// Hair of the simulated head, which is not skin: ribbons that face the camera, blended from far to near
 // over the scattered light, on an undercoat that darkens covered skin.
 //
 //   hair           radiance of hair times its coverage, and coverage
@@ -14,7 +14,7 @@ V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crow
 
 V.registerFaceParts = () => {
   const at = V.groups.findIndex(([id]) => id === "expression") + 1;
-  V.groups.splice(at, 0, ["parts", "Eyes and hair", "Parts of the simulated head that are no skin.", true]);
+  V.groups.splice(at, 0, ["parts", "Eyes and hair", "Parts of the simulated head that are not skin.", true]);
   V.controls.push(
     {group: "parts", kind: "range", path: ["eyes_open"], min: 0, max: 1, label: "Eyes open", show: V.percent,
       help: "Opening of the lids; expressions add to it. 0 %: closed."},

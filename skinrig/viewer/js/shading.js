@@ -10,7 +10,7 @@ Object.assign(V.defaults, {
 //   adjust     names of `void f(inout SurfacePoint s)`, called in order
 //   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
 //   width      name of `float f(vec2 uv)`: width of scattering relative to the profile, or null
-//   parts      functions that draw what is no skin, see V.drawHeads
+//   parts      functions that draw what is not skin, see V.drawHeads
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
   chunks: ["static_relief"], defines: {}, slopes: [], adjust: [],
@@ -48,7 +48,7 @@ V.framed = heads => {
   return {camera_distance_mm: Math.min(5 * Math.round(away / 5), V.FARTHEST_MM)};
 };
 
-// Draw all heads, each with its parts that are no skin: functions (ctx, side, p, frame).
+// Draw all heads, each with its parts that are not skin: functions (ctx, side, p, frame).
 V.drawHeads = (ctx, program, uniforms, parts = []) => {
   V.headShifts(ctx.p).forEach((shift, i) => {
     const camera = V.camera(ctx.p, ctx.size, shift);
