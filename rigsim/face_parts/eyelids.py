@@ -48,8 +48,8 @@ CANTHUS_REACH_MM: Final = 6.0
 CANTHUS_DEPTH_MM: Final = (4.5, 2.0)
 """Depth by which the inner and the outer corner sink when the eye opens."""
 CANTHUS_BLEND_MM: Final = 5.0
-_SHEET_MM: Final = 1.2
-"""Depth of the conjunctiva behind the skin at the corners of the eye."""
+_JOIN_MM: Final = 3.0
+"""Difference in depth below which the lids' sphere and the corners' plane blend."""
 _REGION_MM: Final = ((4.0, 62.0), (0.0, 45.0), -45.0)
 """Range of x and y, and lowest z, of the vertices that open the eye."""
 
@@ -248,7 +248,7 @@ def _open(
         hugging = hugging * np.exp(-((np.maximum(outside, 0.0) / CANTHUS_BLEND_MM) ** 2))[None, :]
         for j in column:
             rest_z = np.interp(moved[:, j, 1], y[:, j], at[:, j, 2])
-            front = lid_front(x[:, j], moved[:, j, 1], center, ends)
+            front = _lid_front(x[:, j], moved[:, j, 1], center, ends)
             z = rest_z + hugging[:, j] * (front - rest_z)
             moved[:, j, 2] = np.where(part[:, j], z, moved[:, j, 2])
     return moved
@@ -274,35 +274,16 @@ def _smooth(t: Float64Array) -> Float64Array:
     return t * t * (3.0 - 2.0 * t)
 
 
-def _front(
-    x: Float64Array,
-    y: Float64Array,
-    center: Float64Array,
-    ends: Float64Array,
-    radius: float,
-    behind: float,
+def _lid_front(
+    x: Float64Array, y: Float64Array, center: Float64Array, ends: Float64Array
 ) -> Float64Array:
-    """Return z of a sphere around the eyeball, joined smoothly to the sheet between the corners."""
+    """Return z of the open lids: a sphere around the eyeball, joined smoothly to the corners."""
     flat = (x - center[0]) ** 2 + (y - center[1]) ** 2
-    sphere = center[2] + np.sqrt(np.maximum(radius**2 - flat, 0.0))
+    sphere = center[2] + np.sqrt(np.maximum((APEX_MM + LID_MM) ** 2 - flat, 0.0))
     share = (x - ends[0, 0]) / (ends[1, 0] - ends[0, 0])
-    sheet = ends[0, 2] + share * (ends[1, 2] - ends[0, 2]) - behind
-    h = np.maximum(3.0 - np.abs(sphere - sheet), 0.0) / 3.0
-    return np.asarray(np.maximum(sphere, sheet) + 0.75 * h * h)
-
-
-def lid_front(
-    x: Float64Array, y: Float64Array, center: Float64Array, ends: Float64Array
-) -> Float64Array:
-    """Return z of the open lids' outer surface around the eyeball, mm; x, y of any shape."""
-    return _front(x, y, center, ends, APEX_MM + LID_MM, 0.0)
-
-
-def eye_front(
-    x: Float64Array, y: Float64Array, center: Float64Array, ends: Float64Array
-) -> Float64Array:
-    """Return z of sclera and conjunctiva between the corners, mm; x, y of any shape."""
-    return _front(x, y, center, ends, SCLERA_RADIUS_MM, _SHEET_MM)
+    sheet = ends[0, 2] + share * (ends[1, 2] - ends[0, 2])
+    h = np.maximum(_JOIN_MM - np.abs(sphere - sheet), 0.0) / _JOIN_MM
+    return np.asarray(np.maximum(sphere, sheet) + 0.25 * _JOIN_MM * h * h)
 
 
 def _arc_middle(

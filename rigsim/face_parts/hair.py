@@ -60,7 +60,7 @@ class Hair:
     Attributes
     ----------
     points_mm
-        Curves, shape (S, `CURVE_POINTS`, 3), rig frame, eyes closed; brows, then lashes, then scalp.
+        Curves with closed eyes, shape (S, `CURVE_POINTS`, 3), rig frame: brows, lashes, scalp.
     opening_mm
         Displacement of the lashes relative to their roots when the eyes are open, shape
         (L, `CURVE_POINTS`, 3).

@@ -5,7 +5,9 @@
 //   p.eyes_open    0: the skin is as without eyes; 1: open, to which expressions add
 //   p.eyes_follow  1: both eyes look at the camera as far as they can turn
 Object.assign(V.defaults, {eyes_open: 0, eyes_follow: 1});
-V.EYES = {ROWS: 11, YAW: 26, UP: 16, DOWN: 20, MARGIN_MM: 0.35};
+// Rows of the drawn grid; farthest turns of the gaze, degrees; distance of skin from the eye; depth of
+// the conjunctiva behind the corners, and difference in depth below which it joins the sclera.
+V.EYES = {ROWS: 11, YAW: 26, UP: 16, DOWN: 20, MARGIN_MM: 0.35, SHEET_MM: 1.2, JOIN_MM: 3};
 
 V.lidsOpen = p => Boolean(V.lids) && p.eyes_open > 0;
 V.opening = p => {
@@ -75,7 +77,7 @@ V.gaze = (p, center, eye) => {
 V.eyeGrid = (mesh, lid) => {
   const {sclera_radius_mm: radius} = V.scene.facts.face_parts;
   const count = lid.margins.length / 2;
-  const rows = V.EYES.ROWS;
+  const {ROWS: rows, SHEET_MM: deep, JOIN_MM: join} = V.EYES;
   const at = v => [0, 1, 2].map(k => mesh.positions[3 * v + k]);
   const ends = [1, count - 2].map(i => at(lid.margins[2 * i]));
   const out = {position: [], seen: []};
@@ -87,9 +89,9 @@ V.eyeGrid = (mesh, lid) => {
       const [x, y] = [0, 1].map(k => low[k] + part * (up[k] - low[k]));
       const flat = (x - lid.center[0]) ** 2 + (y - lid.center[1]) ** 2;
       const sphere = lid.center[2] + Math.sqrt(Math.max(radius * radius - flat, 0));
-      const sheet = ends[0][2] + share * (ends[1][2] - ends[0][2]) - 1.2;
-      const h = Math.max(3 - Math.abs(sphere - sheet), 0) / 3;
-      const z = Math.max(sphere, sheet) + 0.75 * h * h;
+      const sheet = ends[0][2] + share * (ends[1][2] - ends[0][2]) - deep;
+      const h = Math.max(join - Math.abs(sphere - sheet), 0) / join;
+      const z = Math.max(sphere, sheet) + 0.25 * join * h * h;
       const edge = r === 0 ? low : r === rows + 1 ? up : null;
       const outside = i === 0 || i === count - 1;
       out.position.push(...(edge ?? [x, y, outside ? Math.min(z, up[2] - 0.8) : z]));
