@@ -157,7 +157,9 @@ V.hairBuffers = (side, p) => {
 V.drawHair = (ctx, side, p, uniforms) => {
   const gl = V.gl;
   const mesh = V.movedMesh(side, p);
-  const frame = {...uniforms, ...V.lightFrame(side, p)};
+  // all heads are hidden by the depth of the whole image
+  const frame = {...uniforms, ...V.lightFrame(side, p),
+    b_irradiance: ctx.side.buffers.get("irradiance").texture};
   V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "shadow_lookup", "hair_depth",
     "undercoat_fragment"], {PI: "3.14159265358979"}), side, p, {...frame, u_shown: [p.hair, p.brows]});
   gl.bindVertexArray(mesh.vao);
