@@ -9,6 +9,7 @@ Equal demo folders give equal images. The two screenshots need playwright and Ch
 
 from __future__ import annotations
 
+import base64
 import io
 import shutil
 import sys
@@ -182,16 +183,50 @@ def fused_person(demo: Path) -> None:
 
 # screenshots -------------------------------------------------------------------------------------
 
+PEOPLE = (("II", 1), ("IV", 2), ("VI", 3))
+"""Skin types and seeds of the people on the live page."""
+PEOPLE_LIGHTS = ((35, 30), (0, 15), (-60, 25))
+"""Azimuth and elevation of their light, degrees."""
+PEOPLE_VIEW = {"camera_distance_mm": 520, "camera_target_mm": [0, 12, -40]}
+PEOPLE_PX = 270
+
+
+def people(browser: Any, folder: Path) -> None:
+    """Draw three people of the live page, a row each, under three lights."""
+    rows = []
+    for preset, seed in PEOPLE:
+        live = folder / f"{preset}.html"
+        live.write_text(page.build(faces.build_scene(preset=preset, seed=seed)), encoding="utf-8")
+        tab = browser.new_page()
+        tab.goto(live.as_uri())
+        tab.wait_for_selector("html[data-ready=true]", timeout=READY_MS, state="attached")
+        tab.evaluate("size => window.viewer.resize(...size)", [2 * PEOPLE_PX, 2 * PEOPLE_PX])
+        row = []
+        for azimuth, elevation in PEOPLE_LIGHTS:
+            light = {"light_azimuth_deg": azimuth, "light_elevation_deg": elevation}
+            tab.evaluate("change => window.viewer.set(change)", PEOPLE_VIEW | light)
+            found = tab.evaluate("() => window.viewer.read('display')")
+            values = np.frombuffer(base64.b64decode(found["data"]), "<f4")
+            image = values.reshape(found["height"], found["width"], 4)[..., :3]
+            row.append(image.reshape(PEOPLE_PX, 2, PEOPLE_PX, 2, 3).mean(axis=(1, 3)))
+        rows.append(np.concatenate(row, axis=1))
+        tab.close()
+    codes = np.rint(255.0 * np.concatenate(rows)).astype(np.uint8)
+    write("gallery-people.png", Image.fromarray(codes))
+
 
 def screenshots(demo: Path) -> None:
-    """Photograph the live page and the first screen of the report."""
+    """Photograph the live page, three people on it, and the first screen of the report."""
     chromium = shutil.which("chromium")
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
         chromium = None
     if chromium is None:
-        print("viewer.png, report.png: not made, run `make browser` first", file=sys.stderr)
+        print(
+            "viewer.png, gallery-people.png, report.png: not made, run `make browser` first",
+            file=sys.stderr,
+        )
         return
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         live = Path(name) / "face.html"
@@ -203,6 +238,7 @@ def screenshots(demo: Path) -> None:
         tab.evaluate("size => window.viewer.resize(...size)", [1024, 834])
         tab.evaluate(HIDE_TIME)
         write("viewer.png", Image.open(io.BytesIO(tab.screenshot())))
+        people(browser, Path(name))
         tab = browser.new_page(viewport={"width": 1280, "height": 800}, device_scale_factor=0.75)
         tab.goto((demo / "report.html").resolve().as_uri())
         shot = Image.open(io.BytesIO(tab.screenshot()))

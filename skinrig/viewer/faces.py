@@ -20,6 +20,7 @@ from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
@@ -114,6 +115,7 @@ ASSET_BUILDERS: Final[Mapping[str, Callable[[SceneSource], Assets]]] = MappingPr
         "basis BRDFs and traits": fitted_assets.build_assets,
         "wrinkles": wrinkle_assets.build_assets,
         "microstructure": microstructure_assets.build_assets,
+        "eyes and hair": face_part_assets.build_assets,
     }
 )
 """Builders of the page's assets by content, in the order of its parts; they are independent."""

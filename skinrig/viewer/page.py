@@ -15,7 +15,7 @@ from skinrig.viewer.packing import PackedScene, pack
 from skinrig.viewer.scene import SceneError, ViewerScene
 
 SCRIPT_NAMES: Final = (
-    "graph gl load mesh camera color lights shading shadow crowd strain wrinkles detail "
+    "graph gl load mesh camera color lights shading shadow crowd eyes hair strain wrinkles detail "
     "microstructure tiles scattering reflectance display costs probes drag address panel timeline "
     "compare controls main"
 ).split()

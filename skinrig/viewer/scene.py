@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, TypedDict, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
 from rigsim.geometry.mesh import Mesh
@@ -86,7 +87,7 @@ class Assets(TypedDict, total=False):
     """Additions of an asset builder to a scene; every key is optional."""
 
     textures: Mapping[str, Texture]
-    tables: Mapping[str, Float32Array]
+    tables: Mapping[str, NDArray[Any]]
     params: Mapping[str, Any]
     presets: Mapping[str, Mapping[str, Any]]
     facts: Mapping[str, Any]
@@ -147,7 +148,7 @@ class ViewerScene:
     mesh
         Geometry and blend shapes.
     textures, tables
-        Textures and tables by name. A table is a float32 array of any shape, or (rows, columns,
+        Textures and tables by name. A table is an array of any shape, or float32 of (rows, columns,
         channels) if the page samples it; row 0 first, not flipped.
     params
         Initial parameters of the page, JSON values.
@@ -163,7 +164,7 @@ class ViewerScene:
 
     mesh: Mesh
     textures: Mapping[str, Texture] = field(default_factory=dict)
-    tables: Mapping[str, Float32Array] = field(default_factory=dict)
+    tables: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)

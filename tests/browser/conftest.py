@@ -6,7 +6,7 @@ import base64
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -152,10 +152,11 @@ def open_page(
 
 @pytest.fixture(scope="session")
 def procedural_scene() -> Any:
-    """The procedural head with textures of 256 texels."""
+    """The procedural head with textures of 256 texels, its skin alone: eyes closed, no hair."""
     from skinrig.viewer import faces as procedural
 
-    return procedural.build_scene(size=256)
+    scene = procedural.build_scene(size=256)
+    return replace(scene, params={**scene.params, "eyes_open": 0, "brows": 0, "hair": 0})
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,10 @@ in vec2 v_uv;
 layout(location = 0) out vec4 o_display;
 void main() {
   vec4 radiance = texel_radiance(ivec2(gl_FragCoord.xy));
+#ifdef HAS_hair
+  vec4 hair = texel_hair(ivec2(gl_FragCoord.xy));
+  radiance = vec4(radiance.rgb * (1.0 - hair.a) + hair.rgb, radiance.a + hair.a * (1.0 - radiance.a));
+#endif
   vec3 exposed = p_exposure * radiance.rgb;
   vec3 shown = srgb(p_filmic > 0.5 ? filmic(exposed) : exposed);
   o_display = vec4(mix(p_background, shown, radiance.a), 1.0);

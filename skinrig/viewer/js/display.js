@@ -5,7 +5,7 @@ Object.assign(V.defaults, {
 });
 
 V.start.push(() => V.passes.push({
-  name: "display", after: ["radiance"], key: p => [p.exposure, p.filmic, p.background].join(),
+  name: "display", after: ["radiance", "hair"], key: p => [p.exposure, p.filmic, p.background].join(),
   targets: () => ({display: {format: "RGBA8", size: V.screen(), space: "screen"}}),
   draw: ctx => ctx.full(V.program(["full_vertex"], ["tone", "display_fragment"])),
   cost: () => ({taps: V.screen()[0] * V.screen()[1], bytes: 4 * V.screen()[0] * V.screen()[1]}),

@@ -31,8 +31,8 @@ V.morph = weights => {
 };
 
 // Normals weighted by the angle of each face; vertices at one place share a normal.
-V.vertexNormals = positions => {
-  const {faces, weld} = V.scene.mesh;
+V.vertexNormals = (positions, faces = V.scene.mesh.faces) => {
+  const {weld} = V.scene.mesh;
   const sum = new Float64Array(positions.length);
   const e = new Float64Array(9);
   for (let f = 0; f < faces.length; f += 3) {
@@ -101,16 +101,19 @@ V.vertexTangents = positions => {
 
 // The moved mesh of a side, computed where its weights changed.
 V.movedMesh = (side, p) => {
-  const key = V.weightsKey(p);
+  const key = V.moveKey(p);
   if (side.mesh?.key === key) return side.mesh;
   const gl = V.gl;
   const mesh = side.mesh ?? {
     vao: gl.createVertexArray(),
     buffers: ["position", "normal", "tangent", "bitangent"].map(() => gl.createBuffer()),
   };
-  const positions = V.morph(p.weights);
-  const turned = V.vertexNormals(positions);
-  const normals = Float32Array.from(V.scene.mesh.normals, (n, i) => n + turned[i] - V.restAngles[i]);
+  const open = V.lidsOpen(p);
+  const positions = V.moveLids(V.morph(p.weights), p);
+  const turned = V.vertexNormals(positions, open ? V.openFaces : V.scene.mesh.faces);
+  const rest = open ? V.openAngles : V.restAngles;
+  const normals = Float32Array.from(V.scene.mesh.normals, (n, i) => n + turned[i] - rest[i]);
+  if (open) V.lids.forEach(lid => lid.vertices.forEach(v => normals.set(turned.subarray(3 * v, 3 * v + 3), 3 * v)));
   for (let i = 0; i < normals.length; i += 3) {
     const size = Math.hypot(normals[i], normals[i + 1], normals[i + 2]) || 1;
     for (let c = 0; c < 3; c++) normals[i + c] /= size;
@@ -129,13 +132,13 @@ V.movedMesh = (side, p) => {
     gl.enableVertexAttribArray(V.ATTRIBUTES[name]);
     gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
   }
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.faces);
-  side.mesh = {vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, open ? V.staticBuffers.openFaces : V.staticBuffers.faces);
+  side.mesh = {count: (open ? V.openFaces : V.scene.mesh.faces).length, vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
   return side.mesh;
 };
 
 V.drawMesh = (side, p) => {
   const mesh = V.movedMesh(side, p);
   V.gl.bindVertexArray(mesh.vao);
-  V.gl.drawElements(V.gl.TRIANGLES, V.scene.mesh.faces.length, V.faceType, 0);
+  V.gl.drawElements(V.gl.TRIANGLES, mesh.count, V.faceType, 0);
 };

@@ -10,10 +10,11 @@ Object.assign(V.defaults, {
 //   adjust     names of `void f(inout SurfacePoint s)`, called in order
 //   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
 //   width      name of `float f(vec2 uv)`: width of scattering relative to the profile, or null
+//   parts      functions that draw what is not skin, see V.drawHeads
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
   chunks: ["static_relief"], defines: {}, slopes: [], adjust: [],
-  specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig", "albedo_traits"], keys: [],
+  specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig", "albedo_traits"], keys: [], parts: [],
 };
 
 V.surfaceDefines = () => ({PI: "3.14159265358979", LEAST_TABLE_M: V.LEAST_TABLE_M.toFixed(4),
@@ -48,18 +49,21 @@ V.framed = heads => {
   return {camera_distance_mm: Math.min(5 * Math.round(away / 5), V.FARTHEST_MM)};
 };
 
-V.drawHeads = (ctx, program, uniforms) => {
+// Draw all heads, each with its parts that are not skin: functions (ctx, side, p, frame).
+V.drawHeads = (ctx, program, uniforms, parts = []) => {
   V.headShifts(ctx.p).forEach((shift, i) => {
     const camera = V.camera(ctx.p, ctx.size, shift);
     const p = V.headParams(ctx.p, i);
     const side = V.headSide(ctx.side, ctx.p, i);
-    V.use(program, side, p, {u_view: camera.view, u_projection: camera.projection,
-      u_eye: camera.eye, ...V.lightFrame(side, p), ...uniforms});
+    const frame = {u_view: camera.view, u_projection: camera.projection, u_eye: camera.eye,
+      ...V.lightFrame(side, p), ...uniforms};
+    V.use(program, side, p, frame);
     V.drawMesh(side, p);
+    parts.forEach(draw => draw(ctx, side, p, frame));
   });
 };
 
-V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
+V.meshKey = p => [V.moveKey(p), V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
 V.screen = () => [V.canvas.width, V.canvas.height];
 
 V.start.push(() => {
@@ -80,7 +84,7 @@ V.start.push(() => {
         "surface_point", "skin_color", "kelemen_specular", "environment_light", "shadow_lookup",
         ...V.surface.chunks,
         V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
-      V.drawHeads(ctx, program, V.lightUniforms(ctx.p));
+      V.drawHeads(ctx, program, V.lightUniforms(ctx.p), V.surface.parts);
     },
     cost: p => ({taps: (8 + 25 * V.shadowed(p)) * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
   });
@@ -94,7 +98,8 @@ V.start.push(() => {
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
       V.drawHeads(ctx, V.program(["mesh_attributes", "mesh_vertex"],
-        ["surface_varyings", "skin_color", "inspect_fragment"], V.colorDefines()));
+        ["surface_varyings", "skin_color", "inspect_fragment"], V.colorDefines()), {},
+      V.surface.parts.map(draw => (...of) => draw(...of, "eye_inspect_fragment")));
     },
     cost: () => ({taps: 6 * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
   });

@@ -39,7 +39,7 @@ V.shadowed = p => p.shadows > 0.5 && p.light_intensity > 0;
 V.start.push(() => {
   V.passes.push({
     name: "shadow", after: [], depth: true, enabled: V.shadowed,
-    key: p => [V.weightsKey(p), p.light_azimuth_deg, p.light_elevation_deg].join(),
+    key: p => [V.moveKey(p), p.light_azimuth_deg, p.light_elevation_deg].join(),
     targets: p => ({shadow_depth: {format: "R32F", size: [p.shadow_px, p.shadow_px], space: "light",
       filter: "nearest"}}),
     draw: ctx => {

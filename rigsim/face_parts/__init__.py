@@ -1,0 +1,1 @@
+"""Parts of a face that are not skin: eyes behind lids that open, and hair."""

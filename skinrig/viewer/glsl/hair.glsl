@@ -1,0 +1,150 @@
+//@chunk hair_depth
+// Whether the surface of the skin hides a point; crowds share one depth.
+bool hiddenBySkin(float depth, float tolerance) {
+  float skin = texel_irradiance(ivec2(gl_FragCoord.xy)).a;
+  return skin > 0.0 && depth > skin + tolerance;
+}
+//@chunk undercoat_vertex
+uniform mat4 u_view;
+uniform mat4 u_projection;
+in float a_coverage;
+out float v_depth;
+out float v_coverage;
+void main() {
+  passAttributes();
+  vec4 seen = u_view * vec4(a_position, 1.0);
+  v_depth = -seen.z;
+  v_coverage = a_coverage;
+  gl_Position = u_projection * seen;
+}
+//@chunk undercoat_fragment
+uniform vec3 u_to_light;
+uniform vec3 u_multiple;
+uniform vec2 u_shown;
+in float v_depth;
+in float v_coverage;
+layout(location = 0) out vec4 o_hair;
+void main() {
+  bool brow = v_position.z > -55.0 && v_position.y < 55.0;
+  float covered = v_coverage * (brow ? u_shown.y : u_shown.x);
+  if (covered < 0.01 || hiddenBySkin(v_depth, 0.4)) discard;
+  vec3 normal = normalize(v_normal);
+  float direct = clamp(dot(normal, u_to_light), 0.0, 1.0);
+  vec3 light = vec3(0.6 * p_light_intensity * direct + p_ambient * (0.5 + 0.3 * normal.y));
+  o_hair = vec4(covered * light * (u_multiple + 0.004), covered);
+}
+//@chunk hair_light
+// Share of the key light at a curve: few comparisons above the skin of its root.
+uniform vec3 u_light_center;
+uniform vec3 u_light_right;
+uniform vec3 u_light_up;
+uniform vec3 u_light_to;
+uniform float u_light_scale;
+float hairLit(vec3 position) {
+#ifdef HAS_shadow_depth
+  if (p_shadows < 0.5) return 1.0;
+  vec3 from = position - u_light_center;
+  float height = dot(from, u_light_to);
+  vec2 at = vec2(dot(from, u_light_right), dot(from, u_light_up)) * u_light_scale + 0.5;
+  float sum = 0.0;
+  for (int i = 0; i < 4; i++) {
+    vec2 there = at * p_shadow_px + 2.0 * vec2(float(i & 1) - 0.5, float(i >> 1) - 0.5);
+    ivec2 texel = clamp(ivec2(there), ivec2(0), ivec2(int(p_shadow_px) - 1));
+    sum += clamp(1.0 - (texel_shadow_depth(texel).r - height - 2.5) / 5.0, 0.0, 1.0);
+  }
+  return 0.25 * sum;
+#else
+  return 1.0;
+#endif
+}
+//@chunk hair_vertex
+uniform mat4 u_view;
+uniform mat4 u_projection;
+uniform vec3 u_eye;
+uniform float u_pixels;
+in vec3 a_position;
+in vec3 a_tangent;
+in vec3 a_normal;
+in vec4 a_fiber;  // side, 0 at the root to 1 at the tip, seed, width mm (negative: a lock)
+out vec3 v_position;
+out vec3 v_tangent;
+out vec3 v_normal;
+out vec4 v_fiber;
+out float v_depth;
+out float v_lit;
+void main() {
+  float width = abs(a_fiber.w);
+  bool lock = a_fiber.w < 0.0;
+  float taper = lock ? 1.0 - 0.75 * a_fiber.y * a_fiber.y : 1.0 - 0.85 * a_fiber.y;
+  float depth = -(u_view * vec4(a_position, 1.0)).z;
+  float pixel = depth / u_pixels;
+  float half_mm = 0.5 * width * taper;
+  float drawn = max(half_mm, 0.55 * pixel);
+  vec3 to_eye = normalize(u_eye - a_position);
+  vec3 across = normalize(cross(a_tangent, to_eye));
+  v_position = a_position + a_fiber.x * drawn * across;
+  v_tangent = a_tangent;
+  v_normal = a_normal;
+  v_fiber = vec4(a_fiber.xyz, lock ? -half_mm / drawn : half_mm / drawn);
+  v_lit = hairLit(a_position);
+  vec4 seen = u_view * vec4(v_position, 1.0);
+  v_depth = -seen.z;
+  gl_Position = u_projection * seen;
+}
+//@chunk hair_fragment
+// Marschner et al. 2003 (doi 10.1145/882262.882345): reflection R, transmission TT and inner
+// reflection TRT with Gaussian longitudinal lobes; absorption as in d'Eon et al. 2011; multiple
+// scattering as the diffuse term of Kajiya and Kay 1989 with the albedo of Chiang et al. 2016.
+uniform vec3 u_eye;
+uniform vec3 u_to_light;
+uniform vec3 u_absorption;
+uniform vec3 u_multiple;
+in vec3 v_position;
+in vec3 v_tangent;
+in vec3 v_normal;
+in vec4 v_fiber;
+in float v_depth;
+in float v_lit;
+layout(location = 0) out vec4 o_hair;
+float lobe(float x, float width) { return exp(-0.5 * x * x / (width * width)) / (2.5066 * width); }
+float hashed(vec2 at) { return fract(sin(dot(at, vec2(127.1, 311.7))) * 43758.5453); }
+void main() {
+  if (hiddenBySkin(v_depth, 0.6)) discard;
+  bool lock = v_fiber.w < 0.0;
+  float alpha = abs(v_fiber.w);
+  float tone = 1.0;
+  if (lock) {
+    // about nine strands across a lock, thinner towards the tip
+    float strand = 4.5 * v_fiber.x + 40.0 * v_fiber.z;
+    float cell = floor(strand);
+    float reach = 0.55 + 0.45 * hashed(vec2(cell, v_fiber.z));
+    alpha *= smoothstep(0.0, 0.12, reach - v_fiber.y) * (0.55 + 0.45 * (1.0 - abs(2.0 * (strand - cell) - 1.0)));
+    tone = 0.75 + 0.5 * hashed(vec2(cell, v_fiber.z + 0.37));
+  } else {
+    alpha *= 1.0 - smoothstep(0.85, 1.0, v_fiber.y);
+  }
+  vec3 along = normalize(v_tangent);
+  vec3 to_eye = normalize(u_eye - v_position);
+  float sin_i = dot(along, u_to_light);
+  float sin_r = dot(along, to_eye);
+  float cos_i = sqrt(max(1.0 - sin_i * sin_i, 0.0));
+  vec3 light_flat = u_to_light - sin_i * along;
+  vec3 eye_flat = to_eye - sin_r * along;
+  float cos_phi = dot(light_flat, eye_flat) / max(length(light_flat) * length(eye_flat), 1e-3);
+  float half_cos = sqrt(clamp(0.5 + 0.5 * cos_phi, 0.0, 1.0));
+  float sum = sin_i + sin_r;
+  float base = 1.0 - sqrt(clamp(0.5 + 0.5 * dot(u_to_light, to_eye), 0.0, 1.0));
+  float fresnel = 0.046 + 0.954 * pow(base, 5.0);
+  vec3 inside = exp(-1.6 * u_absorption / max(cos_i, 0.3));
+  vec3 direct = vec3(lobe(sum + 0.12, 0.16) * 0.25 * half_cos * fresnel)
+    + lobe(sum - 0.06, 0.08) * exp(-3.65 * cos_phi - 3.98) * inside * 0.9
+    + lobe(sum - 0.18, 0.30) * exp(17.0 * cos_phi - 16.78) * inside * inside * 0.9 * fresnel * 4.0;
+  vec3 normal = normalize(v_normal);
+  float facing = clamp((dot(normal, u_to_light) + 0.35) / 1.35, 0.0, 1.0);
+  // hair around a strand hides its root
+  float depth_shade = lock ? mix(0.25, 1.0, smoothstep(0.0, 0.8, v_fiber.y)) : 0.55;
+  vec3 diffuse = (u_multiple + 0.15 * inside * inside * inside) * cos_i;
+  vec3 light = p_light_intensity * v_lit * facing * depth_shade * (PI * direct * cos_i + diffuse)
+    + p_ambient * depth_shade * (0.6 + 0.4 * normal.y) * (u_multiple + 0.15 * inside * inside * inside);
+  o_hair = vec4(alpha * tone * light, alpha);
+}

@@ -1,0 +1,175 @@
+// Hair of the simulated head, which is not skin: ribbons that face the camera, blended from far to near
+// over the scattered light, on an undercoat that darkens covered skin.
+//
+//   hair           radiance of hair times its coverage, and coverage
+//   p.brows        1: brows and lashes are drawn
+//   p.hair         1: the scalp's hair is drawn
+Object.assign(V.defaults, {brows: 0, hair: 0});
+V.ATTRIBUTES.a_fiber = 8;
+V.ATTRIBUTES.a_coverage = 9;
+V.HAIR_POINTS = 5;
+
+V.haired = p => Boolean(V.hair) && (p.brows > 0.5 || p.hair > 0.5);
+V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
+
+V.registerFaceParts = () => {
+  const at = V.groups.findIndex(([id]) => id === "expression") + 1;
+  V.groups.splice(at, 0, ["parts", "Eyes and hair", "Parts of the simulated head that are not skin.", true]);
+  V.controls.push(
+    {group: "parts", kind: "range", path: ["eyes_open"], min: 0, max: 1, label: "Eyes open", show: V.percent,
+      help: "Opening of the lids; expressions add to it. 0 %: closed."},
+    {group: "parts", kind: "toggle", path: ["eyes_follow"], label: "Eyes follow the camera",
+      off: p => !V.lidsOpen(p), help: "Both eyes turn to the camera, up to 26° sideways."},
+    {group: "parts", kind: "toggle", path: ["brows"], label: "Brows and lashes"},
+    {group: "parts", kind: "toggle", path: ["hair"], label: "Hair of the scalp"},
+  );
+};
+
+V.start.push(() => {
+  const parts = V.scene.facts.face_parts;
+  if (!parts) return;
+  V.registerFaceParts();
+  const gl = V.gl;
+  const table = name => V.scene.tables[name].data;
+  const roots = table("hair_roots");
+  const kinds = Object.entries(parts.counts)
+    .flatMap(([kind, count]) => Array(count).fill(kind));
+  const fiber = [];
+  for (let s = 0; s < roots.length; s++) {
+    const seed = (s * 0.61803398875) % 1;
+    for (let k = 0; k < V.HAIR_POINTS; k++) {
+      const t = k / (V.HAIR_POINTS - 1);
+      const width = parts.width_mm[kinds[s]] * (kinds[s] === "scalp" ? -1 : 1);
+      for (const one of [-1, 1]) fiber.push(one, t, seed, width);
+    }
+  }
+  V.hair = {roots, kinds, count: roots.length, points: table("hair_points"),
+    opening: table("hair_opening"), fiber: gl.createBuffer(), coverage: gl.createBuffer()};
+  gl.bindVertexArray(null);
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.fiber);
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(fiber), gl.STATIC_DRAW);
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
+  gl.bufferData(gl.ARRAY_BUFFER, table("hair_coverage"), gl.STATIC_DRAW);
+  V.passes.push({
+    name: "hair", after: ["surface", "shadow"], enabled: V.haired,
+    key: p => [V.hairKey(p), p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.ambient,
+      V.shadowed(p)].join(),
+    targets: () => ({hair: {format: "RGBA16F", size: V.screen(), space: "screen", filter: "nearest"}}),
+    draw: ctx => {
+      ctx.clear(0, 0, 0, 0);
+      const color = {u_absorption: parts.absorption, u_multiple: parts.multiple_scattering,
+        u_to_light: V.direction(ctx.p.light_azimuth_deg, ctx.p.light_elevation_deg)};
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      V.headShifts(ctx.p).forEach((shift, i) => {
+        const camera = V.camera(ctx.p, ctx.size, shift);
+        const p = V.headParams(ctx.p, i);
+        V.drawHair(ctx, V.headSide(ctx.side, ctx.p, i), p, {u_view: camera.view,
+          u_projection: camera.projection, u_eye: camera.eye, u_pixels: camera.pixelsPerMmAt1,
+          ...color});
+      });
+      gl.disable(gl.BLEND);
+    },
+    cost: () => ({taps: V.screen()[0] * V.screen()[1], bytes: 8 * V.screen()[0] * V.screen()[1]}),
+  });
+});
+
+// Curves of a pose: points, tangents and the skin's normals at the roots.
+V.hairCurves = (mesh, p) => {
+  const {roots, count, points, opening, kinds} = V.hair;
+  const steps = V.scene.facts.face_parts.hair_steps_per_mm;
+  const n = V.HAIR_POINTS;
+  const first = kinds.indexOf("lash");
+  const w = V.lidsOpen(p) ? V.opening(p) : 0;
+  const at = new Float32Array(3 * n * count);
+  for (let s = 0; s < count; s++) {
+    const lash = kinds[s] === "lash";
+    for (let k = 0; k < 3 * n; k++) {
+      const more = lash ? w * opening[3 * n * (s - first) + k] : 0;
+      at[3 * n * s + k] = mesh.positions[3 * roots[s] + k % 3] + (points[3 * n * s + k] + more) / steps;
+    }
+  }
+  return at;
+};
+
+V.hairBuffers = (side, p) => {
+  const mesh = V.movedMesh(side, p);
+  const gl = V.gl;
+  const n = V.HAIR_POINTS;
+  const {count, roots, kinds} = V.hair;
+  const made = side.hair ?? {vao: gl.createVertexArray(),
+    buffers: ["position", "tangent", "normal", "faces"].map(() => gl.createBuffer())};
+  side.hair = made;
+  gl.bindVertexArray(made.vao);
+  if (made.moved !== mesh.key) {
+    const at = V.hairCurves(mesh, p);
+    const [position, tangent, normal] = [0, 1, 2].map(() => new Float32Array(6 * n * count));
+    for (let s = 0; s < count; s++) {
+      for (let k = 0; k < n; k++) {
+        const here = 3 * (n * s + k);
+        const [before, after] = [k ? here - 3 : here, k < n - 1 ? here + 3 : here];
+        for (let c = 0; c < 3; c++) {
+          for (const one of [0, 3]) {
+            position[2 * here + one + c] = at[here + c];
+            tangent[2 * here + one + c] = at[after + c] - at[before + c];
+            normal[2 * here + one + c] = mesh.normals[3 * roots[s] + c];
+          }
+        }
+      }
+    }
+    [position, tangent, normal].forEach((data, i) => {
+      const place = V.ATTRIBUTES[["a_position", "a_tangent", "a_normal"][i]];
+      gl.bindBuffer(gl.ARRAY_BUFFER, made.buffers[i]);
+      gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 0, 0);
+    });
+    gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.fiber);
+    gl.enableVertexAttribArray(V.ATTRIBUTES.a_fiber);
+    gl.vertexAttribPointer(V.ATTRIBUTES.a_fiber, 4, gl.FLOAT, false, 0, 0);
+    [made.moved, made.at, made.order] = [mesh.key, at, null];
+  }
+  // from far to near along the camera's axis
+  const order = [V.cameraKey(p), p.brows, p.hair].join();
+  if (made.order !== order) {
+    const back = V.direction(p.camera_yaw_deg, p.camera_pitch_deg);
+    const middle = 3 * (n >> 1);
+    const depth = s => back.reduce((sum, b, c) => sum + b * made.at[3 * n * s + middle + c], 0);
+    const drawn = Array.from({length: count}, (_, s) => s)
+      .filter(s => (kinds[s] === "scalp" ? p.hair : p.brows) > 0.5)
+      .map(s => [depth(s), s]).sort((a, b) => a[0] - b[0]);
+    const index = new Uint32Array(6 * (n - 1) * drawn.length);
+    let to = 0;
+    for (const [, s] of drawn) {
+      for (let k = 0; k < n - 1; k++) {
+        const a = 2 * (n * s + k);
+        index.set([a, a + 1, a + 2, a + 1, a + 3, a + 2], to);
+        to += 6;
+      }
+    }
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.buffers[3]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.DYNAMIC_DRAW);
+    [made.order, made.indices] = [order, index.length];
+  }
+  return made;
+};
+
+V.drawHair = (ctx, side, p, uniforms) => {
+  const gl = V.gl;
+  const mesh = V.movedMesh(side, p);
+  // all heads are hidden by the depth of the whole image
+  const frame = {...uniforms, ...V.lightFrame(side, p),
+    b_irradiance: ctx.side.buffers.get("irradiance").texture};
+  V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "shadow_lookup", "hair_depth",
+    "undercoat_fragment"], {PI: "3.14159265358979"}), side, p, {...frame, u_shown: [p.hair, p.brows]});
+  gl.bindVertexArray(mesh.vao);
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
+  gl.enableVertexAttribArray(V.ATTRIBUTES.a_coverage);
+  gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 1, gl.UNSIGNED_BYTE, true, 0, 0);
+  gl.drawElements(gl.TRIANGLES, mesh.count, V.faceType, 0);
+  const made = V.hairBuffers(side, p);
+  V.use(V.program(["hair_light", "hair_vertex"], ["hair_depth", "hair_fragment"], {PI: "3.14159265358979"}),
+    side, p, frame);
+  gl.bindVertexArray(made.vao);
+  gl.drawElements(gl.TRIANGLES, made.indices, gl.UNSIGNED_INT, 0);
+};

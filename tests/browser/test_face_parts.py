@@ -1,0 +1,102 @@
+"""Eyes, brows, lashes and hair of the simulated head, which are not skin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigsim.face_parts import eyelids
+from skinrig.viewer import page
+
+pytestmark = pytest.mark.long
+
+CLOSE = {"camera_distance_mm": 230, "camera_target_mm": [0, 24, -10], "microstructure": 0}
+
+
+def test_closed_eyes_leave_every_pixel_as_without_parts(open_page, procedural_scene, viewer):
+    """Bit for bit: the same scene without the tables has no eyes and no hair at all."""
+    tables = {n: t for n, t in procedural_scene.tables.items() if n[:4] not in ("lid_", "hair")}
+    facts = {n: f for n, f in procedural_scene.facts.items() if n != "face_parts"}
+    plain = open_page(page.build(replace(procedural_scene, tables=tables, facts=facts)))
+    for change in ({}, {"weights": {"surprise": 1.2}, "camera_yaw_deg": 25}):
+        plain.set(**change)
+        viewer.set(**change)
+        for name in ("display", "irradiance", "specular", "normal", "inspect"):
+            np.testing.assert_array_equal(viewer.read(name), plain.read(name))
+
+
+def test_lids_move_as_simulated_head_opens(viewer, procedural_scene):
+    """Within the steps of the table; float32 positions add 1e-5 mm."""
+    closed, _ = viewer.mesh()
+    for weight in (0.3, 1.0):
+        viewer.set(eyes_open=weight)
+        moved, _ = viewer.mesh()
+        expected = closed.astype(np.float64)
+        for lids in eyelids.build_eyelids(procedural_scene.mesh):
+            expected[lids.vertices] += lids.displacement_mm(weight)
+        np.testing.assert_allclose(moved, expected, atol=1.5 / 512.0)
+
+
+def test_open_eye_is_masked_as_no_skin(viewer):
+    """Between the lids nothing of the inspection is left, about 10 by 29 mm per eye."""
+    viewer.set(**CLOSE)
+    closed = viewer.read("inspect")[..., :2].any(axis=-1)
+    viewer.set(eyes_open=1)
+    opened = viewer.read("inspect")[..., :2].any(axis=-1)
+    lost = closed & ~opened
+    pixel_mm = 2.0 * 240.0 * np.tan(np.radians(14.0)) / 256.0
+    assert 2.0 * 140.0 < lost.sum() * pixel_mm**2 < 2.0 * 230.0
+    assert not (opened & ~closed).any()
+    # eyes are drawn there, none of the pixels is empty
+    assert (viewer.read("albedo")[lost][:, 3] > 0.0).all()
+
+
+def test_expression_moves_no_skin_into_eyes(viewer, procedural_scene):
+    eyes = eyelids.build_eyelids(procedural_scene.mesh)
+    for name in ("surprise", "disgust", "happiness"):
+        viewer.set(weights={"surprise": 0, "disgust": 0, "happiness": 0, name: 1.5}, eyes_open=1)
+        moved, _ = viewer.mesh()
+        for lids in eyes:
+            off = np.linalg.norm(moved[lids.vertices] - lids.center_mm, axis=-1)
+            assert off.min() > eyelids.APEX_MM + 0.3
+
+
+def test_pupils_turn_to_camera_where_they_follow(viewer):
+    """The pupils are the darkest parts of both eyes; they are seen within a pixel of 0.5 mm.
+
+    The cornea's paraxial image of the iris is 10.0 mm in front of the eyeball's center, where
+    perspective enlarges movements by 4 %.
+    """
+
+    def pupils():
+        albedo = viewer.read("albedo")
+        eye = (albedo[..., 3] > 0.0) & ~viewer.read("inspect")[..., :2].any(axis=-1)
+        dark = eye & (albedo[..., 0] < 0.004)
+        halves = (dark[:, :128], dark[:, 128:])
+        return [float(np.nonzero(half)[1].mean()) for half in halves]
+
+    viewer.set(**CLOSE, eyes_open=1, camera_yaw_deg=20, eyes_follow=1)
+    follow = pupils()
+    viewer.set(eyes_follow=0)
+    ahead = pupils()
+    pixel_mm = 2.0 * 240.0 * np.tan(np.radians(14.0)) / 256.0
+    yaw = np.radians(20.0)
+    eye = np.array([230.0 * np.sin(yaw), 230.0 * np.cos(yaw) - 10.0])
+    for moved, x in zip(np.subtract(follow, ahead), (-31.5, 31.5), strict=True):
+        turn = min(np.arctan2(eye[0] - x, eye[1] + 18.6), np.radians(26.0))
+        expected = np.sin(turn) * np.cos(yaw) + (1.0 - np.cos(turn)) * np.sin(yaw)
+        np.testing.assert_allclose(moved * pixel_mm, 10.4 * expected, atol=pixel_mm)
+
+
+def test_hair_changes_only_pixels_it_covers(viewer):
+    bald = viewer.read("display")
+    viewer.set(hair=1, brows=1)
+    covered = viewer.read("hair")[..., 3]
+    haired = viewer.read("display")
+    np.testing.assert_array_equal(haired[covered == 0.0], bald[covered == 0.0])
+    assert (covered > 0.9).mean() > 0.02
+    # brighter hair has less melanin, darker skin stays what it is behind uncovered pixels
+    assert haired[covered > 0.9, :3].mean() < bald[covered > 0.9, :3].mean()
+    assert viewer.problems == []
