@@ -51,6 +51,15 @@ def choice(*values: str, text: str | None = None, metavar: str | None = None) ->
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
 Seed = Annotated[int, option("Random seed.")]
+ExecutorName = Annotated[
+    str,
+    option(
+        "Where independent tasks run: threads (one after the other in this process), local:N (N "
+        "processes) or tcp://HOST:PORT (a Dask scheduler).",
+        "--executor",
+        metavar="TEXT",
+    ),
+]
 DaysAgo = Annotated[
     int,
     option(
