@@ -134,13 +134,16 @@ def judge_case(case: Case, folder: Path) -> Iterator[IntervalTrial]:
 def run_case(order: CaseOrder) -> CaseOutcome:
     """Run and judge a case, and write its record atomically; an error is part of the outcome.
 
-    A case that two workers run, because one was taken for lost, writes equal records.
+    A case that has a record is not run again. One that two workers run at once, because one of them
+    was taken for lost, writes equal records.
 
     Parameters
     ----------
     order
         The case, and where its record goes.
     """
+    if read_record(order.out, order.key) is not None:  # of a worker that ended after writing it
+        return CaseOutcome(order.key, "", 0.0)
     begun_s = time.process_time()
     error = ""
     work: Path | None = None

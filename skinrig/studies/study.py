@@ -10,13 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from skinrig.executors import (
-    SERIAL_EXECUTOR,
-    ExecutorLost,
-    check_executor,
-    describe_lost_task,
-    open_executor,
-)
 from skinrig.studies import results
 from skinrig.studies.cases import (
     WORK_FOLDER,
@@ -29,6 +22,13 @@ from skinrig.studies.cases import (
     run_case,
 )
 from skinrig.studies.description import Case, StudyError, StudyFile, software_hash
+from skinrig.studies.executors import (
+    SERIAL_EXECUTOR,
+    ExecutorLost,
+    check_executor,
+    describe_lost_task,
+    open_executor,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ def run_study(
     out
         Folder of the records and results; a second run of the same study does no work.
     executor
-        See `skinrig.executors.open_executor`.
+        See `skinrig.studies.executors.open_executor`.
     keep
         Whether sessions, calibrations and maps are kept, in ``out/sessions``.
     judge
@@ -77,7 +77,7 @@ def run_study(
     ------
     StudyError
         If the study is not valid, or another command is writing to `out`.
-    skinrig.executors.ExecutorLost
+    skinrig.studies.executors.ExecutorLost
         If the connection to the scheduler is lost; the records of completed cases stay.
     """
     check_executor(executor)

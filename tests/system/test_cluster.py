@@ -9,12 +9,16 @@ import threading
 import time
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+import tifffile
+from fixtures.faulty_stacks import dome, render
 from fixtures.product_code import ROOT
 from fixtures.study_judge import PAUSE_VARIABLE, judge_by_drawing
 
-from skinrig.executors import ExecutorLost
+from skinrig.cli import main
 from skinrig.studies.description import CaseGroup, StudyFile
+from skinrig.studies.executors import ExecutorLost
 from skinrig.studies.study import run_study
 
 pytestmark = pytest.mark.long
@@ -156,3 +160,46 @@ def test_killed_scheduler_loses_no_completed_case(tmp_path, serial):
 def test_missing_scheduler_is_one_error(tmp_path):
     with pytest.raises(ExecutorLost, match="no scheduler at"):
         run_study(study(), tmp_path, executor="tcp://127.0.0.1:9", judge=judge_by_drawing)
+
+
+@pytest.fixture(scope="module")
+def stacks(tmp_path_factory):
+    """Two sessions of images of a sphere under listed lights."""
+    place = tmp_path_factory.mktemp("stacks")
+    for seed in (1, 2):
+        folder = place / f"images-{seed}"
+        folder.mkdir()
+        rng = np.random.default_rng(seed)
+        lights = dome(12, rng, 60)
+        images, _ = render("ball", lights, rng, side=48, gloss=0.2, noise=0.005)
+        rows = [str(len(lights))]
+        for number, (image, light) in enumerate(zip(images, lights, strict=True)):
+            tifffile.imwrite(folder / f"{number:02d}.tif", image.astype(np.float32))
+            rows.append(f"{number:02d}.tif {' '.join(map(str, light))}")
+        (folder / "lights.lp").write_text("\n".join(rows), encoding="utf-8")
+        assert main(["import", "olat", str(folder), "--out", str(place / f"session-{seed}")]) == 0
+    return [place / f"session-{seed}" for seed in (1, 2)]
+
+
+def reconstruct(sessions, out, executor):
+    words = ["--maps", "normals", "--out", str(out), "--executor", executor]
+    return main(["reconstruct", *map(str, sessions), *words])
+
+
+def test_sessions_on_workers_give_same_maps(stacks, tmp_path):
+    for name, executor in (("a", "threads"), ("b", "local:2")):
+        assert reconstruct(stacks, tmp_path / name, executor) == 0
+    files = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*")]
+    assert len(files) > 4
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_error_of_worker_is_that_of_serial_run(stacks, tmp_path, capsys):
+    words = []
+    for executor in ("threads", "local:1"):
+        damaged = tmp_path / "session"
+        damaged.mkdir(exist_ok=True)
+        assert reconstruct([damaged, *stacks], tmp_path / executor[:5], executor) == 3
+        words.append(capsys.readouterr().err.splitlines()[-1])
+    assert words[0] == words[1]

@@ -7,15 +7,9 @@ from types import SimpleNamespace
 import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
-from skinrig import executors
 from skinrig.errors import MissingExtra, UnusableError
-from skinrig.studies.description import (
-    CaseGroup,
-    StudyError,
-    StudyFile,
-    read_study,
-    software_hash,
-)
+from skinrig.studies import executors
+from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
 from skinrig.studies.study import run_study
 
 TEXT = """

@@ -4,6 +4,7 @@ Tasks get paths and settings, never arrays: what is large passes through a file 
 workers share. Scheduling, restarts of lost workers and repetition of their tasks are those of Dask.
 """
 
+import logging
 import re
 import sys
 from collections.abc import Iterator
@@ -19,6 +20,14 @@ ONE_THREAD: Final = dict.fromkeys(
     ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
 """Environment of a worker process: N workers use N threads."""
+FEW_SAMPLES: Final = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.worker.memory.monitor-interval": "500ms",
+}
+"""Settings of local processes: Dask samples stacks, memory and event loops less often."""
 CONNECT_TIMEOUT_S: Final = 10
 _LOCAL: Final = re.compile(r"local:([1-9]\d{0,3})")
 _REMOTE: Final = re.compile(r"(tcp|tls)://\S+:\d+")
@@ -72,16 +81,20 @@ def open_executor(text: str) -> Iterator[Executor | None]:
         yield None
         return
     try:
+        import dask
         import distributed
     except ImportError as error:
         raise MissingExtra(f"--executor {text}", "cluster") from error
+    if not logging.getLogger().isEnabledFor(logging.INFO):  # it prints each step of a start
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
     local = _LOCAL.fullmatch(text)
     where: Any = text
     if local is not None:
+        dask.config.set(FEW_SAMPLES)  # for this process: it has the scheduler, and ends with it
         where = distributed.LocalCluster(
             n_workers=int(local[1]),
             threads_per_worker=1,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             env=ONE_THREAD,
             silence_logs="CRITICAL",
         )
