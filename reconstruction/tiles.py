@@ -4,13 +4,16 @@ The only interface for parallel and distributed work: any executor with ``submit
 ``concurrent.futures`` pool or ``distributed.Client(...).get_executor()`` alike.
 """
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
+from numba import get_num_threads
+
 from model.checks import Checks
+
+MAX_THREADS = 8
 
 Tile = TypeVar("Tile")
 Result = TypeVar("Result")
@@ -77,12 +80,13 @@ def map_on_threads(
     *,
     window: int = 8,
 ) -> list[Result]:
-    """Return ``fn(tile)`` of all tiles: on an executor, or on one thread per core, at most 8.
+    """Return ``fn(tile)`` of all tiles: on an executor, or on Numba's number of threads, at most 8.
 
-    Several tiles get threads if no executor is given; one runs in this thread. The other
-    parameters are those of :func:`map_tiles`.
+    Several tiles get threads if no executor is given; one runs in this thread. A worker process of
+    a cluster has one (``NUMBA_NUM_THREADS``). Tiles write into arrays of this process, so the
+    executor is one of threads. The other parameters are those of :func:`map_tiles`.
     """
     if executor is not None or len(tiles) < 2:
         return list(map_tiles(fn, tiles, executor=executor))
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+    with ThreadPoolExecutor(min(get_num_threads(), MAX_THREADS)) as pool:
         return list(map_tiles(fn, tiles, executor=pool, window=window))

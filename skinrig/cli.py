@@ -110,6 +110,7 @@ for command in (
     fusing.fuse,
     measuring.bench,
     measuring.soak,
+    measuring.study,
     measuring.doctor,
     rendering.render,
     editing.edit,

@@ -72,9 +72,15 @@ def share_kernels(environment: MutableMapping[str, str]) -> None:
 
 
 def thread_count() -> int:
-    """Return the number of threads for rendering: this process's cores, 2 to 16."""
+    """Return the number of threads for rendering: this process's cores, 2 to 16.
+
+    ``NUMBA_NUM_THREADS``, which bounds the compiled loops, bounds it as well.
+    """
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
         cores = os.cpu_count() or 1
+    bound = os.environ.get("NUMBA_NUM_THREADS", "")
+    if bound.isdecimal():
+        cores = min(cores, int(bound))
     return max(MIN_THREADS, min(cores, MAX_THREADS))

@@ -346,6 +346,26 @@ def load_tissue(text: str, *, seed: int) -> ProbedTissue:
         raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
 
 
+def subject_melanin(text: str, *, seed: int) -> float:
+    """Return the volume fraction of melanosomes around which a subject's skin varies.
+
+    Parameters
+    ----------
+    text
+        A preset, a skin tone, a member of the population or a file.
+    seed
+        Seed of the variation between subjects.
+
+    Examples
+    --------
+    >>> subject_melanin("IV", seed=0), round(subject_melanin("P07", seed=0), 4)
+    (0.0395, 0.0148)
+    """
+    if re.fullmatch(r"P\d+", text):
+        return _member_skin(text).melanin
+    return load_subject(text).skin(seed=seed).melanin
+
+
 def _member_skin(name: str) -> PersonSkin:
     try:
         return get_member(name).skin

@@ -29,7 +29,7 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
     ("Report, render and export", ("report", "status", "view", "render", "export")),
-    ("Measure errors and run times", ("bench", "soak")),
+    ("Measure errors and run times", ("bench", "soak", "study")),
 )
 OTHER_SECTION: Final = "More"
 

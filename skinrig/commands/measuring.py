@@ -1,4 +1,4 @@
-"""`skinrig bench`, `skinrig soak`, `skinrig doctor`: errors, faults, and the installation."""
+"""`skinrig bench`, `skinrig soak`, `skinrig study`, `skinrig doctor`: errors, faults, checks."""
 
 import os
 from pathlib import Path
@@ -8,8 +8,8 @@ import typer
 
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
-from skinrig.commands import completion
-from skinrig.commands.options import Json, Seed, command
+from skinrig.commands import completion, options
+from skinrig.commands.options import Json, Out, Seed, command
 from skinrig.commands.renamed_options import FORMER_STAGES, replace_former_values
 from skinrig.console import Console, select_attributes
 from skinrig.doctor import FIX_KEY, check_controller, check_installation
@@ -164,6 +164,44 @@ def soak(
     console.print_document("skinrig.soak/1", figures)
     if result.failure:
         raise typer.Exit(errors.EXIT_LIMIT_MISSED)
+
+
+@command
+def study(
+    description: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
+    /,
+    out: Out,
+    executor: options.ExecutorName = "threads",
+    keep: bool = False,
+    json: Json = False,
+) -> None:
+    """Simulate, reconstruct and judge many cases; write a table and a report by skin type.
+
+    A case that has a result is not computed again, so that an interrupted study continues. A case
+    that fails is a row with its error, and runs again with the next command.
+
+    Example: skinrig study study.toml --out study --executor local:4
+
+    Parameters
+    ----------
+    description
+        TOML file of subjects, seeds, rigs and sizes, see docs/how-to/run-a-study.md.
+    keep
+        Keep sessions, calibrations and maps of the cases; default: they are deleted after judging.
+    """
+    from skinrig.studies.description import read_study
+    from skinrig.studies.study import describe_run, run_study
+
+    console = Console(json)
+    described = read_study(description)
+    run = run_study(described, out, executor=executor, keep=keep, progress=console.progress)
+    figures = describe_run(run)
+    console.print_each("failed", (f"{run.cases[k].name}: {e}" for k, e in run.errors.items()))
+    names = ("cases", "ran", "reused", "processor_s")
+    rows = [(name.replace("_", " "), figures[name]) for name in names]
+    console.print_table(("quantity", "number"), [*rows, ("failed", len(run.errors))])
+    console.print_line(f"{out}: report.html, study.csv; open the report in a browser")
+    console.print_document("skinrig.study_run/1", {"path": out, **figures})
 
 
 def doctor(

@@ -69,6 +69,15 @@ HelpAll = Annotated[
     ),
 ]
 Seed = Annotated[int, option("Random seed.")]
+ExecutorName = Annotated[
+    str,
+    option(
+        "Where independent tasks run: threads (one after the other in this process), local:N (N "
+        "processes) or tcp://HOST:PORT (a Dask scheduler).",
+        "--executor",
+        metavar="TEXT",
+    ),
+]
 DaysAgo = Annotated[
     int,
     option(

@@ -9,11 +9,21 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, MeshFile, NewMaps, OptionalOut, Out, choice, command
+from skinrig.commands.options import (
+    ExecutorName,
+    Json,
+    MeshFile,
+    NewMaps,
+    OptionalOut,
+    Out,
+    choice,
+    command,
+)
 from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
 from skinrig.next_steps import shell_quote, suggest
+from skinrig.studies.executors import SERIAL_EXECUTOR, check_executor
 from skinrig.workspace import scan
 
 
@@ -118,6 +128,7 @@ def reconstruct(
     landmarks: Path | None = None,
     hold_out: str | None = None,
     rank: int | None = None,
+    executor: ExecutorName = "threads",
     json: Json = False,
 ) -> None:
     """Compute maps of a session; stages that are up to date are reused.
@@ -152,9 +163,9 @@ def reconstruct(
         Print the names of the maps that each session yields, and compute nothing.
     """
     from model.store import FORMER_MAP_NAMES
-    from reconstruction.pipeline import recipes as pipeline
     from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import find_comparison_truth
+    from skinrig.studies.reconstruction import ReconstructionOrder, reconstruct_sessions
 
     console = Console(json)
     if list_maps:
@@ -166,26 +177,32 @@ def reconstruct(
             f"{missing}: not given; name the maps and the folder, as --maps melanin --out maps; "
             "--list prints the maps of a session"
         )
+    check_executor(executor)
     check_rank(rank, merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
     wants = replace_former_values(wants, FORMER_MAP_NAMES)
-    made, truths = [], []
-    for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
-        truth = find_comparison_truth(session, state)
-        truths += [truth] if truth else []
-        if len(sessions) > 1:
-            console.print_line(f"{session}:")
-        done = pipeline.reconstruct(
-            session,
-            want=wants,
-            out=folder,
-            calibration=calibration,
+    folders = assign_output_folders(sessions, out)
+    found = [find_comparison_truth(session, state) for session in sessions]
+    truths = [truth for truth in found if truth]
+    far = executor != SERIAL_EXECUTOR  # workers have folders of their own
+    orders = [
+        ReconstructionOrder(
+            session=session.absolute() if far else session,
+            want=tuple(wants),
+            out=folder.absolute() if far else folder,
+            calibration=calibration.absolute() if far and calibration else calibration,
             state=state,
-            landmarks=landmarks,
-            progress=console.progress,
+            landmarks=landmarks.absolute() if far and landmarks else landmarks,
             truth=truth.name if truth else "",
             dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
+        for session, folder, truth in zip(sessions, folders, found, strict=True)
+    ]
+    made = []
+    results = reconstruct_sessions(orders, executor=executor, progress=console.progress)
+    for session, folder, done in zip(sessions, folders, results, strict=True):
+        if len(sessions) > 1:
+            console.print_line(f"{session}:")
         console.print_each("assumed", done.assumed)
         for outcome, names in (("run", done.ran), ("reused", done.reused)):
             if names:

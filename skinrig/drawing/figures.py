@@ -93,6 +93,43 @@ def draw_bars(
     return to_svg(figure, f"{title}, {unit}: {'; '.join(words)}{held}")
 
 
+@dataclass(frozen=True, slots=True)
+class IntervalSeries:
+    """Points with an interval each, and the range that they should reach."""
+
+    name: str
+    values: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    accepted: tuple[float, float]
+    """Range drawn as a band."""
+
+
+def draw_intervals(
+    title: str, labels: Sequence[str], series: Sequence[IntervalSeries], *, unit: str
+) -> str:
+    """Draw points with their intervals above labels, and each series' accepted range as a band."""
+    figure, axes = create_canvas(6.2, 3.0)
+    position = np.arange(len(labels), dtype=float)
+    words = []
+    for number, one in enumerate(series):
+        color = SERIES_COLORS[number % len(SERIES_COLORS)]
+        values, low, high = (np.asarray(part, float) for part in (one.values, one.low, one.high))
+        bars = np.maximum(np.stack([values - low, high - values]), 0.0)
+        shift = 0.15 * (number - (len(series) - 1) / 2)
+        look = {"fmt": "o", "color": color, "ms": 4, "elinewidth": 1, "capsize": 2}
+        axes.axhspan(*one.accepted, color=color, alpha=0.15, lw=0)
+        axes.errorbar(position + shift, values, yerr=bars, label=one.name, **look)
+        known = zip(labels, values, strict=True)
+        shown = (f"{' '.join(label.split())} {v:.3g}" for label, v in known if np.isfinite(v))
+        span = f"accepted {one.accepted[0]:g} to {one.accepted[1]:g}"
+        words.append(f"{one.name} ({span}): {', '.join(shown)}")
+    axes.set_xticks(position, labels, fontsize=8)
+    axes.set_xlim(-0.5, len(labels) - 0.5)
+    _title(axes, title, y_name=unit)
+    return to_svg(figure, f"{title}, {unit}: {'; '.join(words)}")
+
+
 def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
     axes.set_xlabel(x_name)
     axes.set_ylabel(y_name)

@@ -27,6 +27,7 @@ from skinrig.reporting.sections import (
     microrelief,
     sequence,
     session,
+    study,
     subsurface,
 )
 from skinrig.reporting.sections import images as image_section
@@ -215,6 +216,8 @@ def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.B
             yield from bench.section(document, checks)
         elif document["schema"] == extremes.SCHEMA:
             yield from extremes.section(document, checks)
+        elif study.is_study(document):
+            yield from study.section(document, checks)
         else:
             yield from _document_section(document)
 

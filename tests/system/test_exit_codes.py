@@ -78,6 +78,7 @@ UNREADABLE = {
     "analyse color-table": ["--size 8", "file.txt --eumelanin-fraction 0.5 --out t"],
     "analyse lumitexel": ["a"],
     "fuse": ["--out a"],
+    "study": ["--out a", "file.txt", "a b --out c"],
     "soak": ["--hours long", "extra"],
     "session anonymize": [
         "s",
@@ -137,7 +138,11 @@ UNUSABLE = {
     "diagnose": ["none", "file.txt", "folder"],
     "verify": ["none", "file.txt", "folder"],
     "calibrate": ["taste folder", "sensor none"],
-    "reconstruct": ["none --maps melanin --out a", "none --maps normals --out a --rank 1000"],
+    "reconstruct": [
+        "none --maps melanin --out a",
+        "none --maps normals --out a --rank 1000",
+        "none --maps melanin --out a --executor local:0",
+    ],
     "bench": ["--stage coffee", "--budget 0", "--out file.txt"],
     "soak": ["--hours -1", "--first-day -1", "--budget 0", "--seed -1"],
     "session anonymize": [
@@ -195,6 +200,12 @@ UNUSABLE = {
     ],
     "analyse lumitexel": ["none none --out a"],
     "fuse": ["none folder --out a", "folder --out a"],
+    "study": [
+        "none.toml --out a",
+        "file.txt --out a",
+        "none.toml --out a --executor many",
+        "none.toml --out file.txt",
+    ],
 }
 """What another name, number or file would make right."""
 

@@ -8,7 +8,7 @@ that many subjects, however many pixels each has.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from skinrig.arrays import Float64Array
 
 COVERAGE_RANGES: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
 """Nominal coverage, %, and the accepted range of the measured coverage."""
+
+FALSE_ALARM_RATE: Final = 0.05
+"""Largest probability that a run with correct intervals misses a limit."""
 
 GAUSSIAN_95: Final = 1.959964
 """Half width of a 95 % interval of a Gaussian error over that of its 68.27 % interval."""
@@ -37,11 +40,45 @@ class IntervalTrial:
     unit: str
     factor_95: float
     """Half width of the 95 % interval over that of the 68 % one, as the manual defines it."""
+    error: float = float("nan")
+    """Median |estimate - truth|, in `unit`; NaN where it is not defined."""
+
+    @property
+    def truths(self) -> int:
+        """Number of ground truths."""
+        return int(self.deviation.size)
 
     def inside_fraction(self, level: int) -> float:
         """Return the fraction of ground truths inside the intervals of a nominal level, %."""
         reach = {68: 1.0, 95: self.factor_95}[level]
         return float(np.mean(self.deviation <= reach))
+
+
+class JudgedSubject(Protocol):
+    """One subject's errors in one quantity: an `IntervalTrial`, or the record of one."""
+
+    @property
+    def quantity(self) -> str:
+        """Name of the quantity."""
+
+    @property
+    def band(self) -> str:
+        """Band of skin color."""
+
+    @property
+    def width(self) -> float:
+        """Median half width of the 68 % interval, in `unit`."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the width."""
+
+    @property
+    def truths(self) -> int:
+        """Number of ground truths."""
+
+    def inside_fraction(self, level: int) -> float:
+        """Return the fraction of ground truths inside the intervals of a nominal level, %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +107,7 @@ class IntervalCoverage:
 
 
 def pool_trials(
-    trials: Sequence[IntervalTrial], *, level: int, confidence: float = 0.95
+    trials: Sequence[JudgedSubject], *, level: int, confidence: float = 0.95
 ) -> IntervalCoverage:
     """Return the coverage of the trials of one quantity.
 
@@ -96,7 +133,7 @@ def pool_trials(
     (0.667, 'kept')
     """
     quantities = {trial.quantity for trial in trials}
-    if len(quantities) != 1 or not all(trial.deviation.size for trial in trials):
+    if len(quantities) != 1 or not all(trial.truths for trial in trials):
         raise ValueError(
             f"trials: got {len(trials)} of {sorted(quantities)}, expected at least one, all of one "
             "quantity and each with ground truths; omit trials without any"
@@ -108,7 +145,7 @@ def pool_trials(
         bands.pop() if len(bands) == 1 else "all",
         level,
         float(fractions.mean()),
-        _interval(fractions, np.array([trial.deviation.size for trial in trials]), confidence),
+        _interval(fractions, np.array([trial.truths for trial in trials]), confidence),
         len(fractions),
         float(np.median([trial.width for trial in trials])),
         trials[0].unit,
@@ -138,7 +175,7 @@ def _interval(
 
 
 def group_by_band(
-    trials: Sequence[IntervalTrial], *, level: int, confidence: float
+    trials: Sequence[JudgedSubject], *, level: int, confidence: float
 ) -> list[IntervalCoverage]:
     """Return the coverage of every quantity: over all subjects, then band by band.
 
@@ -150,7 +187,7 @@ def group_by_band(
         As in `pool_trials`.
     """
     rows: list[IntervalCoverage] = []
-    counted = [trial for trial in trials if trial.deviation.size]
+    counted = [trial for trial in trials if trial.truths]
     for quantity in dict.fromkeys(trial.quantity for trial in counted):
         of_it = [trial for trial in counted if trial.quantity == quantity]
         bands = dict.fromkeys(trial.band for trial in of_it)
@@ -158,3 +195,19 @@ def group_by_band(
         groups = [of_it, *of_bands] if len(bands) > 1 else [of_it]
         rows += [pool_trials(group, level=level, confidence=confidence) for group in groups]
     return rows
+
+
+def corrected_confidence(trials: Sequence[JudgedSubject]) -> float:
+    """Return the confidence of each coverage at which all share one `FALSE_ALARM_RATE`.
+
+    Parameters
+    ----------
+    trials
+        As in `group_by_band`.
+
+    Notes
+    -----
+    Bonferroni: each coverage is judged at two levels, each with two one-sided limits.
+    """
+    counted = len(group_by_band(trials, level=68, confidence=0.95))
+    return 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * max(counted, 1))

@@ -23,6 +23,7 @@ from skinrig.benchmarks.intervals.coverage import (
     COVERAGE_RANGES,
     IntervalCoverage,
     IntervalTrial,
+    corrected_confidence,
     group_by_band,
 )
 from skinrig.benchmarks.intervals.trials import ANY_BAND
@@ -31,8 +32,6 @@ from skinrig.benchmarks.results import Point, Timing
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 FIRST_SEED: Final = 400
-FALSE_ALARM_RATE: Final = 0.05
-"""Largest probability that a run with correct intervals misses a limit."""
 
 FLASH_PRESETS: Final = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
 GRADIENT_SITES: Final = ("forehead", "cheek", "chin")
@@ -79,9 +78,7 @@ def measure_coverage(stage: BenchmarkStage) -> Iterator[None]:
 def _evaluate_trials(
     stage: BenchmarkStage, trials: Sequence[IntervalTrial], spent: Mapping[str, Timing]
 ) -> None:
-    counted = len(group_by_band(trials, level=68, confidence=0.95))
-    # Bonferroni: `counted` coverages at two levels, each with two one-sided limits, share the rate
-    confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
+    confidence = corrected_confidence(trials)
     tried = (group_by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
     rows = list(itertools.chain(*tried))
     stage.points = [_point(row, spent[row.quantity]) for row in rows]

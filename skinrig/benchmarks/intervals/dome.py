@@ -15,7 +15,13 @@ from reconstruction.surface.errors import interior_error
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import IntervalTrial
-from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
+from skinrig.benchmarks.intervals.trials import (
+    USUAL_CAPTURE,
+    CaptureVariant,
+    TrialSubject,
+    reconstruct_maps,
+    resimulate,
+)
 from skinrig.evaluating import reflection, skin_bands
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.planning.confirmation import calibrate_simulated
@@ -32,20 +38,26 @@ CHANNEL_NAMES: Final = ("red", "green", "blue")
 
 
 def run_trials(
-    folder: Path, subjects: Mapping[int, str], *, width_px: int
+    folder: Path,
+    subjects: Mapping[int, str],
+    *,
+    width_px: int,
+    variant: CaptureVariant = USUAL_CAPTURE,
 ) -> Iterator[IntervalTrial]:
     """Yield trials of normals, diffuse albedo and lobes of faces.
 
     Each seed has its own dome with deviations from the nominal geometry and its own calibration, so
     that calibration errors are independent between subjects. Parameters as in `flash.run_trials`.
     """
-    shown = {key: {"width_px": width_px} for key in ("charuco", "mirror", "white")}
+    target = variant.target_options(width_px=width_px)
+    shown = dict.fromkeys(("charuco", "mirror", "white"), target)
     kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
     for seed, preset in subjects.items():
         with tempfile.TemporaryDirectory(dir=folder) as name:
             own = Path(name)
             calibrate_simulated("dome", own, shown, kinds, seed=seed)
-            done = resimulate("dome", own, subject=preset, seed=seed, width_px=width_px)
+            options = variant.subject_options(width_px=width_px)
+            done = resimulate("dome", own, subject=preset, seed=seed, **options)
             found, truth = reconstruct_maps(own, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
         yield from face_trials(found, truth, f"{preset} {seed}")
 

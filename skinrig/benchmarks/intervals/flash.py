@@ -18,6 +18,8 @@ from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.appearances.contents import intersect_valid
 from skinrig.benchmarks.intervals.coverage import IntervalTrial
 from skinrig.benchmarks.intervals.trials import (
+    USUAL_CAPTURE,
+    CaptureVariant,
     TrialSubject,
     reconstruct_maps,
     resimulate,
@@ -61,6 +63,8 @@ def run_trials(
     width_px: int,
     moving: bool = True,
     resolution: str = "",
+    calibration_seed: int = CALIBRATION_SEED,
+    variant: CaptureVariant = USUAL_CAPTURE,
 ) -> Iterator[IntervalTrial]:
     """Yield trials of melanin and hemoglobin, and of blood and its change by the hemoglobin rig.
 
@@ -76,9 +80,13 @@ def run_trials(
         Whether each subject is captured with a second expression, for the hemoglobin rig.
     resolution
         Suffix of the quantities' names.
+    calibration_seed
+        Seed of the calibration that serves all subjects.
+    variant
+        Age of the calibration, and further options of the captures.
     """
     targets = {"sensor": "flat", "white": "white", "polarization": "malus"}
-    calibrate_flash(folder, targets, width_px)
+    calibrate_flash(folder, targets, width_px, seed=calibration_seed, variant=variant)
     for seed, preset in subjects.items():
         state = BLOOD_STATES[seed % len(BLOOD_STATES)]
         done = resimulate(
@@ -89,6 +97,7 @@ def run_trials(
             width_px=width_px,
             states=("neutral", state) if moving else ("neutral",),
             nearer_mm=draw_stance_offset_mm(seed),
+            **variant.subject_options(),
         )
         found, truth = reconstruct_maps(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5
@@ -103,11 +112,18 @@ def run_trials(
             yield from _rig_trials(done, folder, state, subject)
 
 
-def calibrate_flash(folder: Path, targets: Mapping[str, str], width_px: int) -> None:
+def calibrate_flash(
+    folder: Path,
+    targets: Mapping[str, str],
+    width_px: int,
+    *,
+    seed: int = CALIBRATION_SEED,
+    variant: CaptureVariant = USUAL_CAPTURE,
+) -> None:
     """Calibrate a simulated flash rig; `targets` maps kinds of calibration to their targets."""
-    shown = {key: {"width_px": width_px} for key in targets.values()}
+    shown = {key: variant.target_options(width_px=width_px) for key in targets.values()}
     kinds = ((kind, (target,)) for kind, target in targets.items())
-    calibrate_simulated("flash", folder, shown, kinds, seed=CALIBRATION_SEED)
+    calibrate_simulated("flash", folder, shown, kinds, seed=seed)
 
 
 def _rig_trials(

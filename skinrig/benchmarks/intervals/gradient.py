@@ -27,7 +27,13 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import stretch_skin
 from skinrig.appearances.contents import intersect_valid
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, IntervalTrial
-from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
+from skinrig.benchmarks.intervals.trials import (
+    USUAL_CAPTURE,
+    CaptureVariant,
+    TrialSubject,
+    reconstruct_maps,
+    resimulate,
+)
 from skinrig.evaluating.microrelief import compare_stretch, true_relief
 from skinrig.evaluating.subsurface import read_document
 from skinrig.planning.confirmation import calibrate_simulated
@@ -46,7 +52,11 @@ SIMULATED_BORDER_MM: Final = 1.0
 
 
 def run_trials(
-    folder: Path, subjects: Mapping[int, str], *, width_px: int
+    folder: Path,
+    subjects: Mapping[int, str],
+    *,
+    width_px: int,
+    variant: CaptureVariant = USUAL_CAPTURE,
 ) -> Iterator[IntervalTrial]:
     """Yield trials of normals and heights at rest, and of stretch and kernels under strain.
 
@@ -58,8 +68,10 @@ def run_trials(
     for seed, site in subjects.items():
         with tempfile.TemporaryDirectory(dir=folder) as name:
             own = Path(name)
-            calibrate_simulated("gradient", own, {"ball": {}}, kinds, seed=seed)
+            shown = {"ball": variant.target_options()}
+            calibrate_simulated("gradient", own, shown, kinds, seed=seed)
             options: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
+            options = variant.subject_options(**options)
             done = resimulate("gradient", own, **options)
             found, truth = reconstruct_maps(own, done, ["normals", "height", "strain", "kernels"])
         subject = TrialSubject(f"{site} {seed}")

@@ -12,9 +12,15 @@ from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
-from rigsim.subject.pigment import MELANIN_PRESETS
+from rigsim.population.files import subject_melanin
 from skinrig.benchmarks.intervals.coverage import IntervalTrial
-from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
+from skinrig.benchmarks.intervals.trials import (
+    USUAL_CAPTURE,
+    CaptureVariant,
+    TrialSubject,
+    reconstruct_maps,
+    resimulate,
+)
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
@@ -41,6 +47,7 @@ def run_trials(
     *,
     skin: Mapping[int, str] | None = None,
     directed: Mapping[int, str] | None = None,
+    variant: CaptureVariant = USUAL_CAPTURE,
 ) -> Iterator[IntervalTrial]:
     """Yield trials of the fiber probe's coefficients of media and skin, and of anisotropy.
 
@@ -55,33 +62,40 @@ def run_trials(
         sigma_tr of the homogeneous medium with the nearest profile.
     directed
         "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG" by seed, for axis and ratio.
+    variant
+        Age of the calibration, and further options of the captures.
     """
     for seed, medium in media.items():
-        done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
+        done = _subject(folder, medium, seed, variant, sites=("cheek",), size=PHOTON_BUDGET)
         found, truth = reconstruct_maps(folder, done, ["subsurface"])
         subject = TrialSubject(f"{medium} {seed}")
         yield decay_trial("sigma_tr of media", found, truth, subject)
         for coefficient in COEFFICIENT_LABELS:
             yield coefficient_trial(coefficient, found, truth, subject)
     for seed, preset in (skin or {}).items():
-        done = _subject(folder, preset, seed)
+        done = _subject(folder, preset, seed, variant)
         found, truth = reconstruct_maps(folder, done, ["subsurface"])
-        subject = TrialSubject(f"{preset} {seed}", preset_melanin_band(preset))
+        subject = TrialSubject(f"{preset} {seed}", subject_melanin_band(preset, seed=seed))
         yield decay_trial("sigma_tr of skin", found, truth, subject)
     for seed, medium in (directed or {}).items():
-        done = _subject(folder, medium, seed, sites=("cheek",), angles=(N_DIRECTIONS,))
+        done = _subject(folder, medium, seed, variant, sites=("cheek",), angles=(N_DIRECTIONS,))
         found, truth = reconstruct_maps(folder, done, ["anisotropy"])
         subject = TrialSubject(f"{medium} {seed}")
         yield from direction_trials(found, truth, _farthest_deg(medium), subject)
 
 
-def _subject(folder: Path, subject: str, seed: int, **options: Any) -> SimulationResult:
+def _subject(
+    folder: Path, subject: str, seed: int, variant: CaptureVariant, **options: Any
+) -> SimulationResult:
     """Simulate a subject under a probe that is calibrated with the subject's own phantom."""
-    calibrate_with_own_block(folder, seed)
-    return resimulate("probe", folder, subject=subject, seed=seed, **options)
+    calibrate_with_own_block(folder, seed, variant)
+    given = variant.subject_options(**options)
+    return resimulate("probe", folder, subject=subject, seed=seed, **given)
 
 
-def calibrate_with_own_block(folder: Path, seed: int) -> Path:
+def calibrate_with_own_block(
+    folder: Path, seed: int, variant: CaptureVariant = USUAL_CAPTURE
+) -> Path:
     """Calibrate the probe with a phantom of its own certificate; return FOLDER/calibration.
 
     Subjects with a common calibration would have its errors and the phantom's in common, and would
@@ -93,13 +107,14 @@ def calibrate_with_own_block(folder: Path, seed: int) -> Path:
         As in `flash.run_trials`; a previous calibration is replaced.
     seed
         Seed of the subject.
+    variant
+        Age of the calibration.
     """
     phantom = folder / "session-phantom"
     shutil.rmtree(phantom, ignore_errors=True)
     shutil.rmtree(folder / "truth-phantom", ignore_errors=True)
-    simulate_session(
-        "probe", phantom, target="phantom", seed=BLOCK_SEED_OFFSET + seed, size=PHOTON_BUDGET
-    )
+    options = variant.target_options(size=PHOTON_BUDGET)
+    simulate_session("probe", phantom, target="phantom", seed=BLOCK_SEED_OFFSET + seed, **options)
     paper = folder / "block.json"
     paper.write_text(json.dumps(draw_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET]))))
     calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
@@ -131,15 +146,15 @@ def draw_certificate(rng: np.random.Generator) -> dict[str, Any]:
     return certificate
 
 
-def preset_melanin_band(preset: str) -> str:
-    """Return the melanin band of a preset of simulated subjects.
+def subject_melanin_band(subject: str, *, seed: int) -> str:
+    """Return the melanin band of a simulated subject: a preset, a tone, a member or a file.
 
     Examples
     --------
-    >>> preset_melanin_band("II"), preset_melanin_band("VI")
+    >>> subject_melanin_band("II", seed=0), subject_melanin_band("VI", seed=0)
     ('light', 'dark')
     """
-    return str(skin_bands.classify_melanin(MELANIN_PRESETS[preset]))
+    return str(skin_bands.classify_melanin(subject_melanin(subject, seed=seed)))
 
 
 def decay_trial(

@@ -6,8 +6,8 @@ the simulator wrote.
 """
 
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,6 +46,29 @@ def skin_color_band(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class CaptureVariant:
+    """Departures of trials from a new calibration and a rig's usual capture."""
+
+    calibration_age_days: int = 0
+    """Days between the calibration and the subject's session."""
+    size: Mapping[str, int] = field(default_factory=dict)
+    """Further fields of the orders of targets and subjects, such as lights and views."""
+    subject: Mapping[str, Any] = field(default_factory=dict)
+    """Further fields of the orders of subjects alone."""
+
+    def target_options(self, **options: Any) -> dict[str, Any]:
+        """Return the fields of the orders of calibration targets."""
+        return {**options, **self.size, "days_ago": self.calibration_age_days}
+
+    def subject_options(self, **options: Any) -> dict[str, Any]:
+        """Return the fields of the order of a subject."""
+        return {**options, **self.size, **self.subject}
+
+
+USUAL_CAPTURE: Final = CaptureVariant()
+
+
+@dataclass(frozen=True, slots=True)
 class TrialSubject:
     """Subject of trials, which builds them from errors and stated half widths."""
 
@@ -77,8 +100,11 @@ class TrialSubject:
         shown = half if widths is None else widths
         to_unit = 100.0 if unit == "%" else 1.0
         width = float(to_unit * np.median(shown)) if shown.size else float("nan")
+        error = float(to_unit * np.median(errors * (shown / half))) if shown.size else float("nan")
         deviation = np.asarray(errors / half, np.float64)
-        return IntervalTrial(quantity, self.name, self.band, deviation, width, unit, factor_95)
+        return IntervalTrial(
+            quantity, self.name, self.band, deviation, width, unit, factor_95, error
+        )
 
     def map_trial(
         self,

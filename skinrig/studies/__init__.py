@@ -1,0 +1,1 @@
+"""Studies: many simulated sessions, each judged against its ground truth."""

@@ -1,0 +1,100 @@
+"""Reconstruct several sessions on an executor; each is read and written by its path."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from pathlib import Path
+
+from reconstruction.pipeline import recipes
+from reconstruction.pipeline.inputs import DomeOptions
+from reconstruction.tiles import map_tiles
+from skinrig.studies.executors import ExecutorLost, open_executor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructionOrder:
+    """Small, picklable arguments of `reconstruction.pipeline.recipes.reconstruct`."""
+
+    session: Path
+    want: tuple[str, ...]
+    out: Path
+    calibration: Path | None
+    state: str
+    landmarks: Path | None
+    truth: str
+    dome: DomeOptions
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionSummary:
+    """What a reconstruction did, without its maps, which are in its folder."""
+
+    ran: tuple[str, ...]
+    reused: tuple[str, ...]
+    omitted: tuple[tuple[str, str], ...]
+    assumed: tuple[str, ...]
+    work: tuple[Mapping[str, str], ...]
+
+
+def reconstruct_session(
+    order: ReconstructionOrder, progress: Callable[[str], None] | None = None
+) -> ReconstructionSummary:
+    """Reconstruct one session into its folder.
+
+    Parameters
+    ----------
+    order
+        Session, maps and folders.
+    progress
+        Called with one line before each stage that runs.
+    """
+    done = recipes.reconstruct(
+        order.session,
+        want=order.want,
+        out=order.out,
+        calibration=order.calibration,
+        state=order.state,
+        landmarks=order.landmarks,
+        progress=progress,
+        truth=order.truth,
+        dome=order.dome,
+    )
+    return ReconstructionSummary(done.ran, done.reused, done.omitted, done.assumed, done.work)
+
+
+def reconstruct_sessions(
+    orders: Sequence[ReconstructionOrder], *, executor: str, progress: Callable[[str], None]
+) -> Iterator[ReconstructionSummary]:
+    """Yield the summary of each session, in order.
+
+    Parameters
+    ----------
+    orders
+        Sessions.
+    executor
+        See `skinrig.studies.executors.open_executor`.
+    progress
+        Called before each stage of a session in this process, or after each session elsewhere.
+
+    Raises
+    ------
+    skinrig.studies.executors.ExecutorLost
+        If the connection to the scheduler is lost; maps that were written stay.
+    """
+    with open_executor(executor) as pool:
+        if pool is None:
+            for order in orders:
+                if len(orders) > 1:
+                    progress(str(order.session))
+                yield reconstruct_session(order, progress)
+            return
+        made = map_tiles(reconstruct_session, orders, executor=pool, window=max(len(orders), 1))
+        try:
+            for number, summary in enumerate(made):
+                progress(f"session {number + 1} of {len(orders)}: {orders[number].session}")
+                yield summary
+        except CancelledError as error:
+            raise ExecutorLost(
+                f"--executor: the connection to the scheduler of {executor} was lost; run the "
+                "same command again, complete maps are reused"
+            ) from error

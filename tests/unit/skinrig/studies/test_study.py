@@ -1,0 +1,210 @@
+"""Studies: cases, records that spare work, failures as rows, coverage by skin type."""
+
+import csv
+import json
+from types import SimpleNamespace
+
+import pytest
+from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
+
+from skinrig.errors import MissingExtra, UnusableError
+from skinrig.studies import executors
+from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
+from skinrig.studies.study import run_study
+
+TEXT = """
+schema = "skinrig.study/1"
+title = "Two rigs"
+
+[[groups]]
+rig = "flash"
+subjects = ["I", "VI"]
+seeds = "10..13"
+sizes = [{width_px = 64}]
+
+[[groups]]
+rig = "probe"
+subjects = ["homogeneous:0.1,1"]
+seeds = "10..12"
+"""
+
+
+def group(**changes):
+    usual = {"rig": "flash", "subjects": ("I", "VI"), "seeds": "10..13"}
+    return CaseGroup(**usual | changes)
+
+
+def study_of(*groups):
+    return StudyFile(schema="skinrig.study/1", title="Some cases", groups=groups)
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(TEXT, encoding="utf-8")
+    return path
+
+
+def table(out):
+    with (out / "study.csv").open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def results(out):
+    return [(out / name).read_bytes() for name in ("study.csv", "study.json", "report.html")]
+
+
+def test_seeds_go_round_subjects(written):
+    cases = read_study(written).list_cases()
+    shown = [(case.subject, case.seed) for case in cases if case.rig == "flash"]
+    assert shown == [("I", 10), ("VI", 11), ("I", 12), ("VI", 13)]
+    assert {case.skin for case in cases} == {"I", "VI", "medium"}
+
+
+def test_every_seed_multiplies_subjects_and_ages():
+    made = study_of(group(every_seed=True, calibration_age_days=(0, 30))).list_cases()
+    assert len(made) == 2 * 4 * 2
+    assert made[1].variant == "384 px, calibrated 30 days ago"
+
+
+def test_key_depends_on_everything_that_matters():
+    usual, *others = (
+        study_of(group(**changes)).list_cases()[0]
+        for changes in (
+            {},
+            {"subjects": ("II",)},
+            {"seeds": "11"},
+            {"calibration_age_days": (3,)},
+            {"leave_out": ("lateral",)},
+        )
+    )
+    keys = {case.key("a") for case in (usual, *others)} | {usual.key("b")}
+    assert len(keys) == 6
+    assert usual.key("a") == study_of(group()).list_cases()[0].key("a")
+
+
+def test_key_depends_on_content_of_subject_file(tmp_path):
+    person = tmp_path / "ann.toml"
+    keys = []
+    for melanin in (0.02, 0.03):
+        person.write_text(f'schema = "skinrig.subject/1"\nmelanin = {melanin}\n', encoding="utf-8")
+        keys.append(study_of(group(subjects=(str(person),))).list_cases()[0].key("a"))
+    assert keys[0] != keys[1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"rig": "teapot"}, "rig"),
+        ({"seeds": "9..3"}, "seeds"),
+        ({"subjects": ()}, "subjects"),
+        ({"subjects": ("XX",)}, "XX"),
+        ({"subjects": ("homogeneous:1",), "rig": "probe"}, "homogeneous"),
+        ({"seeds": "0..999999999"}, "at most"),
+        ({"site": "nose"}, "site"),
+        ({"leave_out": ("gold",)}, "gold"),
+    ],
+)
+def test_faulty_group_names_fault(changes, word):
+    with pytest.raises(StudyError, match=word):
+        study_of(group(**changes)).list_cases()
+
+
+def test_second_run_does_no_work(written, tmp_path):
+    study, out = read_study(written), tmp_path / "out"
+    first = run_study(study, out, judge=judge_by_drawing)
+    before = results(out)
+    second = run_study(study, out, judge=None)
+    assert (first.ran, second.ran, len(second.quantities)) == (7, 0, 7)
+    assert results(out) == before
+
+
+def test_missing_and_damaged_records_are_made_again(written, tmp_path):
+    study, out = read_study(written), tmp_path / "out"
+    run_study(study, out, judge=judge_by_drawing)
+    before = results(out)
+    removed, damaged = sorted((out / "cases").iterdir())[:2]
+    removed.unlink()
+    damaged.write_bytes(damaged.read_bytes()[:-40])
+    assert run_study(study, out, judge=judge_by_drawing).ran == 2
+    assert results(out) == before
+
+
+def test_failed_case_is_row_and_runs_again(tmp_path):
+    study = study_of(group(subjects=("I", FAILING_SUBJECT), seeds="1..4"))
+    lines = []
+    first = run_study(study, tmp_path, judge=judge_by_drawing, progress=lines.append)
+    failures = [row["failure"] for row in table(tmp_path) if row["failure"]]
+    assert failures == ["subject: got darkest, expected light"] * 2
+    assert len(first.quantities) == 2
+    assert sum("expected light" in line for line in lines) == 2
+    assert run_study(study, tmp_path, judge=judge_by_drawing).ran == 2
+    assert "2 cases failed" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_sessions_are_deleted_unless_kept(written, tmp_path):
+    study = read_study(written)
+    for name, keep in (("a", False), ("b", True)):
+        run_study(study, tmp_path / name, keep=keep, judge=judge_by_drawing)
+        assert not (tmp_path / name / "work").exists()
+    assert not (tmp_path / "a" / "sessions").exists()
+    assert len(list((tmp_path / "b" / "sessions").glob("*/session"))) == 7
+
+
+def test_coverage_verdict_follows_true_spread(tmp_path):
+    groups = [
+        group(rig=rig, subjects=(subject,), seeds="0..39")
+        for rig, subject in (("flash", "III"), ("probe", "homogeneous:0.1,1"))
+    ]
+    run_study(study_of(*groups), tmp_path, judge=judge_by_drawing)
+    found = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))["quantities"]
+    right, wrong = (
+        next(row for row in found if row["skin"] == skin)["coverage"] for skin in ("III", "medium")
+    )
+    assert {one["verdict"] for one in right.values()} == {"kept"}
+    assert right["68"]["inside"] == pytest.approx(0.683, abs=0.02)
+    assert {one["verdict"] for one in wrong.values()} == {"missed"}
+    assert wrong["68"]["inside"] == pytest.approx(0.383, abs=0.02)
+
+
+def test_second_writer_is_refused(written, tmp_path):
+    study, out = read_study(written), tmp_path / "out"
+
+    def run_inside(case, folder):
+        run_study(study, out, judge=judge_by_drawing)
+        yield from ()
+
+    run = run_study(study, out, judge=run_inside)
+    assert set(run.errors) == set(run.cases)
+    assert all("another study is being written" in text for text in run.errors.values())
+
+
+def test_worker_with_other_software_refuses_case(written, tmp_path, monkeypatch):
+    from skinrig.studies import cases
+
+    monkeypatch.setattr(cases, "software_hash", lambda: "other")
+    run = run_study(read_study(written), tmp_path / "out", judge=judge_by_drawing)
+    assert software_hash() != "other"
+    assert all("another installation" in text for text in run.errors.values())
+
+
+@pytest.mark.parametrize("text", ["local", "local:0", "tcp://host", "processes", "local:x"])
+def test_malformed_executor_is_refused(text):
+    with pytest.raises(UnusableError, match="local:N"):
+        executors.check_executor(text)
+
+
+def test_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    with pytest.raises(MissingExtra, match="cluster"), executors.open_executor("local:2"):
+        pass
+
+
+def test_task_that_ends_workers_is_described(monkeypatch):
+    class KilledWorker(Exception):
+        pass
+
+    fake = SimpleNamespace(KilledWorker=KilledWorker)
+    monkeypatch.setitem(__import__("sys").modules, "distributed", fake)
+    assert "several worker processes" in executors.describe_lost_task(KilledWorker("x"))
+    assert "failed (OSError" in executors.describe_lost_task(OSError("x"))
