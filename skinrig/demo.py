@@ -51,8 +51,6 @@ in the report while the other rigs run.
 REPORT_NAME = "report.html"
 RELOAD_S = 10
 """Seconds after which a browser loads a preliminary report again."""
-SLEEPING_THREADS = {**PASSIVE_WAIT_SETTINGS, "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of parallel rigs, unless the user has set it: the rigs share the cores."""
 SecondsByStep = dict[str, float]
 
 
@@ -205,7 +203,7 @@ def _run_in_processes(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )
     try:
-        with _environment(SLEEPING_THREADS):  # the pool starts its processes on submission
+        with _environment(PASSIVE_WAIT_SETTINGS):  # the pool starts its processes on submission
             futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
         for done in as_completed(futures):
             yield futures[done], done.result()

@@ -7,7 +7,7 @@ the chunks of a small surface, which every estimate reads.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +32,16 @@ BYTES_PER_SAMPLE: Final = 57
 """Bytes of one sample of `Lumitexels`."""
 MAX_CACHED_BYTES: Final = 2**28
 """Up to this size chunks are cached for the next estimate, unless the tables are on disk."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewSamples:
+    """Samples of all images of one camera, as `LumitexelStore` keeps them."""
+
+    table: NDArray[Any]
+    """(L, 2, rows, 3): signal and its standard error over ``scale``."""
+    scale: Float32Array
+    """(L, 2)."""
 
 
 class LumitexelStore:
@@ -152,6 +162,17 @@ class LumitexelStore:
             top = float(np.max(values, where=np.isfinite(values), initial=0.0))
             self._scale[view, light, kind] = top if top > 0 else 1.0
         self._tables[view][light] = row / self._scale[view, light, :, None, None]
+
+    def view_samples(self, view: int) -> ViewSamples:
+        """Return the samples of one camera; do not modify them."""
+        return ViewSamples(self._tables[view], self._scale[view])
+
+    def put_view(self, view: int, samples: ViewSamples) -> None:
+        """Replace the samples of one camera by those of `view_samples` of an equal store."""
+        if samples.table is not self._tables[view]:
+            self._kept.clear()
+            self._tables[view][...] = samples.table
+            self._scale[view] = samples.scale
 
     def chunks(self, size: int) -> Iterator[tuple[slice, Lumitexels]]:
         """Yield the lumitexels of all points, at most `size` at a time (about 60 B per sample)."""

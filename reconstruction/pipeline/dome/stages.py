@@ -18,7 +18,7 @@ from model.vectors import unit_vectors
 from reconstruction import photometric_stereo
 from reconstruction.lumitexels import SampledSurface
 from reconstruction.lumitexels.ray_casting import RayCaster
-from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.lumitexels.store import LumitexelStore, ViewSamples
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.dome.calibrated import CalibratedDome, load_dome, split_exposures
 from reconstruction.pipeline.dome.images import DomeImages
@@ -227,12 +227,17 @@ def sample_surface(
         folder=None if folder is None else Path(folder.name),
     )
     usable = dome.lights.valid if motion is None else dome.lights.valid & motion.usable
-    for view in range(len(dome.cameras)):
-        dome.report_progress("lumitexels", view / len(dome.cameras))
+
+    def sample(view: int) -> ViewSamples:
         for capture in np.flatnonzero(usable).tolist():
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return SurfaceSampleStore(store, folder, len(dome.table.names), dome.report_progress)
+        return store.view_samples(view)
+
+    views = range(len(dome.cameras))
+    for view, samples in enumerate(dome.compute_tiles("lumitexels", views, sample)):
+        store.put_view(view, samples)
+    return SurfaceSampleStore(store, folder, len(dome.table.names), dome.compute_tiles)
 
 
 def _counts(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
