@@ -1,9 +1,9 @@
 """Kill commands with SIGKILL at random moments, repeat them, and compare the bytes.
 
-Each command of `COMMANDS` runs once undisturbed. Then it is killed at a moment drawn uniformly over
-the seconds of the undisturbed run, repeated to its end (`reconstruct`: with the same command,
-`simulate`: with --resume), and its output is compared with the undisturbed one. Stages and tiles
-that begin again although they began before the kill are counted by the events of --json.
+Each command runs twice undisturbed. Then it is killed after seconds drawn uniformly up to half of
+the undisturbed run's, and repeated (`reconstruct`: the same command, `simulate`: with --resume) and
+killed until it ends. Its output is compared with the undisturbed one. Stages and tiles that begin
+again although they began before the kill are counted by the events of --json.
 
     skinrig demo --out DEMO
     python tools/judge_resume.py DEMO --kills 50 --out record.json
@@ -11,6 +11,7 @@ that begin again although they began before the kill are counted by the events o
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -20,11 +21,12 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-RECONSTRUCTIONS: Mapping[str, tuple[str, str, str]] = {
+RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
     "flash": (
         "session-flash-II",
         "calibration-flash",
@@ -42,7 +44,7 @@ RECONSTRUCTIONS: Mapping[str, tuple[str, str, str]] = {
     ),
     "probe": ("session-probe-III", "calibration-probe", "profiles,subsurface,translucency"),
 }
-"""Session, calibration and maps of each rig in the folder of a demo."""
+"""Session, calibration (empty: none) and maps of each rig in the folder of a demo."""
 SIMULATIONS: Mapping[str, Sequence[str]] = {
     "simulate flash": ("flash", "--subject", "IV", "--width", "96"),
     "simulate probe": ("probe", "--subject", "homogeneous:0.08,1.2"),
@@ -60,10 +62,8 @@ class Kill:
         Name of the command.
     after_s, whole_s
         Seconds from the start to the kill, and those of the undisturbed run.
-    killed
-        False when the command had ended before.
     same
-        Whether the output equals the undisturbed one.
+        Whether the final output equals the undisturbed one.
     interrupted
         Stages and tiles at work when the process was killed that began again.
     left_out
@@ -76,7 +76,6 @@ class Kill:
     command: str
     after_s: float
     whole_s: float
-    killed: bool
     same: bool
     interrupted: int
     left_out: tuple[str, ...]
@@ -143,34 +142,36 @@ def count_repeated(
     return interrupted, tuple(complete), seconds
 
 
-def kill_once(
+def kill_until_done(
     name: str,
     run: Sequence[str],
     out: Path,
     *,
     whole: tuple[float, Mapping[str, str]],
-    after_s: float,
+    rng: np.random.Generator,
     again: Sequence[str] = (),
-) -> Kill:
-    """Kill a command after some seconds, repeat it to its end, and compare its output."""
+) -> list[Kill]:
+    """Kill a command at random moments and repeat it until it ends; compare its output."""
     seconds, expected = whole
-    first, second = out.with_suffix(".first"), out.with_suffix(".second")
-    process = start(run, first)
-    try:
-        process.wait(timeout=after_s)
-        killed = False
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        killed = True
-    started = out.exists()
-    code = start([*run, *(again if started else ())], second).wait()
-    before, after = read_events(first), read_events(second)
-    interrupted, left_out, left_out_s = count_repeated(before, after) if killed else (0, (), 0.0)
+    log = out.with_suffix(".log")
+    kills: list[tuple[float, list[tuple[str, float]]]] = []
+    code = None
+    while code is None:
+        after_s = float(rng.uniform(0.0, seconds / 2))
+        process = start([*run, *(again if out.exists() else ())], log)
+        try:
+            code = process.wait(timeout=after_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        kills.append((after_s, read_events(log)))
     same = code == 0 and hash_folder(out) == expected
     same &= not list(out.parent.glob(f".{out.name}.*"))
-    shutil.rmtree(out)
-    return Kill(name, after_s, seconds, killed, same, interrupted, left_out, left_out_s)
+    shutil.rmtree(out, ignore_errors=True)
+    return [
+        Kill(name, after_s, seconds, same, *count_repeated(before, after))
+        for (after_s, before), (_, after) in pairwise(kills)
+    ]
 
 
 def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -> list[Kill]:
@@ -182,7 +183,9 @@ def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -
             runs[name] = (["simulate", *SIMULATIONS[name], "--seed", "3"], ("--resume",))
         else:
             session, calibration, maps = RECONSTRUCTIONS[name]
-            given = [str(demo / session), "--calibration", str(demo / calibration)]
+            given = [str(demo / session)]
+            if calibration:
+                given += ["--calibration", str(demo / calibration)]
             runs[name] = (["reconstruct", *given, "--maps", maps], ())
     found: list[Kill] = []
     undisturbed: dict[str, tuple[float, Mapping[str, str]]] = {}
@@ -198,17 +201,15 @@ def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -
                 raise SystemExit(f"{name}: two undisturbed runs differ")
             undisturbed[name] = time.perf_counter() - began, hashes
         shutil.rmtree(out)
-    while sum(kill.killed for kill in found) < kills:
-        name = list(runs)[len(found) % len(runs)]
+    for name in itertools.cycle(runs):
+        if len(found) >= kills:
+            break
         run, again = runs[name]
-        whole = undisturbed[name]
-        after_s = float(rng.uniform(0.0, whole[0]))
-        found.append(
-            kill_once(
-                name, [*run, "--out", str(out)], out, whole=whole, after_s=after_s, again=again
-            )
-        )
-        print(json.dumps(asdict(found[-1])), flush=True)
+        given_out = [*run, "--out", str(out)]
+        chain = kill_until_done(name, given_out, out, whole=undisturbed[name], rng=rng, again=again)
+        found += chain
+        for kill in chain:
+            print(json.dumps(asdict(kill)), flush=True)
     return found
 
 
@@ -226,7 +227,7 @@ def main() -> int:
     found = judge(given.demo, given.work, names, given.kills, given.seed)
     print("command, kills, same bytes, interrupted parts, complete parts again, their seconds")
     for name in names:
-        own = [kill for kill in found if kill.command == name and kill.killed]
+        own = [kill for kill in found if kill.command == name]
         same = sum(kill.same for kill in own)
         parts = sum(kill.interrupted for kill in own), sum(len(kill.left_out) for kill in own)
         print(name, len(own), same, *parts, round(sum(kill.left_out_s for kill in own), 1))

@@ -14,6 +14,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -44,6 +45,7 @@ FILE_S: Final = 1e-3
 VERSIONED: Final = ("skinrig", "numpy", "scipy", "numba")
 _LOCK_FILE: Final = "lock"
 _RUN_FILE: Final = "run"
+_SCRATCH_SUFFIX: Final = ".scratch"
 
 
 class BusyError(ValueError):
@@ -221,10 +223,21 @@ class Checkpoints:
         """Store the result of a tile of the stage that runs, by its name within the stage."""
         self._store("tile", self._stage, [made], name)
 
+    def scratch_folder(self, name: str) -> Path:
+        """Return a folder for tables of the stage that runs, with those of an interrupted run."""
+        self._open()
+        folder = self._path("scratch", self._stage, name).with_suffix(_SCRATCH_SUFFIX)
+        folder.mkdir(exist_ok=True)
+        return folder
+
     def remove(self) -> None:
-        """Remove the work folder, if this run has locked it."""
+        """Remove the work folder and unfinished maps of killed runs, if this run has the lock."""
         if self._lock is None:
             return
+        unfinished = re.compile(re.escape(self.folder.stem) + r"\.[0-9a-f]{32}\.part")
+        for path in self.folder.parent.iterdir():
+            if unfinished.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(self.folder, ignore_errors=True)
         for made in self._new_folders:
             with suppress(OSError):  # holds the maps
@@ -284,6 +297,8 @@ class Checkpoints:
             for path in self.folder.iterdir():
                 if path.suffix in (".npz", ".part"):
                     path.unlink()
+                elif path.suffix == _SCRATCH_SUFFIX:
+                    shutil.rmtree(path)
             run.write_text(self.identity)
 
     def _close(self) -> None:

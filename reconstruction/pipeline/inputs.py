@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -110,6 +111,13 @@ class Inputs:
     def compute_part(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return the result of one part of a stage, see `compute_tiles`."""
         return next(self.compute_tiles(name, [None], lambda _: compute()))
+
+    def scratch_folder(self, name: str) -> tuple[Path, object]:
+        """Return a folder for a stage's tables, and an object that keeps it until it is freed."""
+        if self.checkpoints is not None:
+            return self.checkpoints.scratch_folder(name), None
+        folder = tempfile.TemporaryDirectory(prefix="skinrig-")
+        return Path(folder.name), folder
 
     def record(self) -> RunRecord:
         """Return what stages add to the record of a run."""

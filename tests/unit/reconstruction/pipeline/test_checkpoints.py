@@ -171,6 +171,15 @@ def test_run_refused_leaves_nothing_behind(tmp_path, error, kept):
     assert (tmp_path / "new").exists() == kept
 
 
+def test_unfinished_maps_of_killed_run_are_removed(tmp_path):
+    interrupt(tmp_path / "out", "draw")
+    kept = tmp_path / ".out.old.part"
+    for folder in (tmp_path / f".out.{'0a' * 16}.part", kept):
+        folder.mkdir()
+    Run(tmp_path / "out").run()
+    assert list(tmp_path.iterdir()) == [kept]
+
+
 def test_work_folder_in_use_is_refused(tmp_path):
     interrupt(tmp_path / "out", "draw")
     with Checkpoints.of_output(tmp_path / "out", {}, RunRecord([], {}, {})):
