@@ -8,10 +8,9 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
-PROGRESS_INTERVAL_S: Final = 5.0
-"""Seconds between two lines about parts of the same step."""
+from skinrig.progress import Progress, watch
 
 
 def to_json_value(value: Any) -> Any:
@@ -79,17 +78,6 @@ def format_count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def format_seconds(seconds: float) -> str:
-    """Format a duration for a message, in s below two minutes, else in min.
-
-    Examples
-    --------
-    >>> format_seconds(42.4), format_seconds(150.0)
-    ('42 s', '2.5 min')
-    """
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
-
-
 def _cell(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
@@ -115,11 +103,19 @@ class Console:
     quiet: bool = False
     """Whether only progress is printed: the caller prints its own summary."""
     started_s: float = field(default_factory=time.perf_counter)
-    _step: str = ""
-    _printed_s: float = 0.0
+    _progress: Progress = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Begin the progress of the command."""
+        self._progress = Progress(self.as_json, self.started_s)
+
+    def __reduce__(self) -> tuple[type, tuple[bool, bool, float]]:
+        """Let another process continue with its own progress."""
+        return type(self), (self.as_json, self.quiet, self.started_s)
 
     def print_line(self, text: str = "") -> None:
-        """Print a line of text."""
+        """Print a line of text; the step of the progress ends."""
+        self._progress.end()
         if not self.quiet:
             stream = sys.stderr if self.as_json else sys.stdout
             print(escape_controls(text), file=stream, flush=True)
@@ -130,25 +126,13 @@ class Console:
         Parameters
         ----------
         text
-            Step that begins; for one part of several as "step: number/count". Lines about parts
-            of the same step are printed every `PROGRESS_INTERVAL_S`, events always.
+            Step that begins; for one part of several with "number/count". Lines about parts of
+            the same step are not printed more often than every few seconds; events always are.
         left_s
-            Estimated seconds that are left; None: unknown.
+            Estimated seconds that are left; None: by the pace of counted parts, or unknown.
         """
-        now = time.perf_counter()
-        seconds = now - self.started_s
-        if self.as_json:
-            event = {"event": "progress", "seconds": round(seconds, 3), "text": text}
-            event["left_s"] = None if left_s is None else round(left_s, 1)
-            print(json.dumps(event), file=sys.stderr, flush=True)
-            return
-        step = text.partition(":")[0]
-        if ":" in text and step == self._step and now - self._printed_s < PROGRESS_INTERVAL_S:
-            return
-        self._step, self._printed_s = step, now
-        left = "" if left_s is None else f" (about {format_seconds(left_s)} left)"
-        line = f"[{seconds:6.1f} s] {escape_controls(text)}{left}"
-        print(line, file=sys.stderr, flush=True)
+        watch(self._progress)
+        self._progress.begin(escape_controls(text), left_s)
 
     def print_table(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
         """Print a table with aligned columns; NaN is printed as a dash."""

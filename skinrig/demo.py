@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from skinrig.console import Console, to_json_value
 from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
+from skinrig.progress import beat_while_running
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
 
@@ -238,7 +240,9 @@ def _run_rig(
 ) -> tuple[DemoResults, SecondsByStep]:
     found = DemoResults()
     shares: SecondsByStep = {}
-    RIGS[rig](RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found))
+    with beat_while_running():
+        timer = partial(_time_step, seconds=shares, console=console)
+        RIGS[rig](RigDemo(out, seed, timer, width_px, found))
     return found, shares
 
 

@@ -8,7 +8,7 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.options import STDOUT_MARK, Json, Page, check_output_file, command
-from skinrig.console import Console, select_attributes
+from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
 
 MAX_PORT = 65_535
@@ -52,6 +52,7 @@ def report(
         raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)
     talk = Console(json or piped)  # messages go to stderr if the page goes to stdout
+    console.progress(f"draw the report of {format_count(len(paths), 'path')}")
     done = build_any(paths, compare=compare)
     if piped:
         typer.echo(done.html, nl=False)
