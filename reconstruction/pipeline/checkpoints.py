@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from reconstruction.pipeline.product_file import (
-    PACKAGES,
+    PRODUCT_PACKAGES,
     DamagedFileError,
     UnstorableError,
     estimate_bytes,
@@ -42,7 +42,7 @@ BYTES_PER_S: Final = 2.5e8
 """Assumed rate of storing before the first file is written, with checksum."""
 FILE_S: Final = 1e-3
 """Seconds to make a file."""
-VERSIONED: Final = ("skinrig", "numpy", "scipy", "numba")
+HASHED_VERSIONS: Final = ("skinrig", "numpy", "scipy", "numba")
 _LOCK_FILE: Final = "lock"
 _RUN_FILE: Final = "run"
 _SCRATCH_SUFFIX: Final = ".scratch"
@@ -56,9 +56,9 @@ class BusyError(ValueError):
 def code_digest() -> str:
     """Hash the code and data of the packages that determine a map, and the versions of others."""
     digest = hashlib.sha256()
-    for name in VERSIONED:
+    for name in HASHED_VERSIONS:
         digest.update(f"{name} {metadata.version(name)}\0".encode())
-    for package in PACKAGES:
+    for package in PRODUCT_PACKAGES:
         root = Path(str(resources.files(package)))
         for path in sorted(root.rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts:
@@ -80,7 +80,7 @@ def work_folder(out: Path) -> Path:
 
 @dataclass(slots=True)
 class RunRecord:
-    """What stages add to the record of a run beside their products."""
+    """Lines and entries that stages add to the record of a run."""
 
     assumed: list[str]
     noted: dict[str, Any]

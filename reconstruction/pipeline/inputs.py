@@ -120,11 +120,11 @@ class Inputs:
         return Path(folder.name), folder
 
     def record(self) -> RunRecord:
-        """Return what stages add to the record of a run."""
+        """Return the record that stages extend."""
         return RunRecord(self.assumed, self.noted, self.hashes)
 
     def options(self) -> dict[str, Any]:
-        """Return everything that products depend on beside the session's rig, as JSON values."""
+        """Return inputs and options that products depend on, as JSON values."""
         folder = self.calibration
         files = [] if folder is None else [folder / f"{kind}.json" for kind in CALIBRATION_KINDS]
         return {

@@ -1,7 +1,7 @@
 """Store products of stages in a file: arrays as NPZ, the rest as JSON, never as pickle.
 
 The file's only executable part is the choice of a dataclass, which must belong to the packages
-`PACKAGES`. ZIP checksums detect a file that was cut or changed.
+`PRODUCT_PACKAGES`. ZIP checksums detect a file that was cut or changed.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-PACKAGES: Final = ("capture", "model", "reconstruction")
+PRODUCT_PACKAGES: Final = ("capture", "model", "reconstruction")
 """Packages whose dataclasses are stored by their fields."""
 _DOCUMENT: Final = "document"
 
@@ -39,7 +39,7 @@ def write_product(path: Path, value: Any) -> int:
         File, in an existing folder; an older one is replaced.
     value
         JSON values, tuples, bytes, NumPy arrays and scalars, mappings with any such keys, and
-        dataclasses of `PACKAGES`, nested.
+        dataclasses of `PRODUCT_PACKAGES`, nested.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def _encode(value: Any, arrays: list[NDArray[Any]], seen: dict[int, int]) -> Any
     if isinstance(value, Mapping):
         return {"mapping": [[nested(key), nested(part)] for key, part in value.items()]}
     kind = type(value)
-    if dataclasses.is_dataclass(kind) and kind.__module__.split(".")[0] in PACKAGES:
+    if dataclasses.is_dataclass(kind) and kind.__module__.split(".")[0] in PRODUCT_PACKAGES:
         parts = {field.name: nested(getattr(value, field.name)) for field in _fields(kind)}
         return {"record": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
     raise UnstorableError(f"got {kind.__module__}.{kind.__qualname__}, expected a storable type")
@@ -166,7 +166,7 @@ def _decode(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
 
 def _record_type(name: str) -> Any:
     module, _, kind = name.partition(":")
-    if module.split(".")[0] not in PACKAGES or not kind.isidentifier():
+    if module.split(".")[0] not in PRODUCT_PACKAGES or not kind.isidentifier():
         raise ValueError(f"got a record {name!r} of another package")
     found = getattr(import_module(module), kind)
     if not (isinstance(found, type) and dataclasses.is_dataclass(found)):

@@ -53,11 +53,11 @@ class RunProgress:
         """Report the beginning of a stage."""
         self._stage = self._waiting.pop(name, 0.0)
         self._stage_started_s = self.clock()
-        self._say(name)
+        self._report_text(name)
 
     def begin_tile(self, name: str, number: int, total: int) -> None:
         """Report the beginning of a tile; ``number`` earlier ones are done."""
-        self._say(f"{name}: {number}/{total}" if total > 1 else name)
+        self._report_text(f"{name}: {number}/{total}" if total > 1 else name)
 
     def seconds_left(self) -> float | None:
         """Estimate the seconds that are left, by the pace of the stages that are done."""
@@ -72,6 +72,6 @@ class RunProgress:
             return pace * rest + OVERRUN_FRACTION * in_stage
         return pace * (rest + self._stage) - in_stage
 
-    def _say(self, text: str) -> None:
+    def _report_text(self, text: str) -> None:
         if self.report is not None:
             self.report(text, self.seconds_left())

@@ -47,7 +47,7 @@ def test_commands_killed_at_random_end_with_same_bytes(tool, session, tmp_path, 
     assert all(kill.interrupted <= 1 for kill in kills)
 
 
-def test_reconstruct_interrupted_at_every_part_ends_with_same_bytes(tool, session, tmp_path):
+def test_reconstruct_interrupted_everywhere_ends_with_same_bytes(tool, session, tmp_path):
     """Each run computes one part and takes up all earlier ones from the work folder."""
     whole, out = tmp_path / "whole", tmp_path / "out"
     recipes.reconstruct(session, want=MAPS, out=whole)

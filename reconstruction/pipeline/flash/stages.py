@@ -365,15 +365,8 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap | Fac
     variance = np.square(map_stderr(diffuse))
     errors = model_error.image_covariance(diffuse.values, variance, diffuse.mask)
     part = rig.inputs.compute_part
-    whole = estimate_face(
-        rgb,
-        table,
-        prior=prior,
-        variance=variance,
-        model_error=errors,
-        has_white=has_white,
-        compute_part=part,
-    )
+    given: dict[str, Any] = {"prior": prior, "variance": variance, "model_error": errors}
+    whole = estimate_face(rgb, table, **given, has_white=has_white, compute_part=part)
     found, by_face = whole.found, whole.by_face
     plain = np.exp(-whole.log_color)
     by_noise = partial(

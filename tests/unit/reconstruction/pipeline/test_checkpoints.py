@@ -125,7 +125,7 @@ def test_run_of_changed_code_takes_up_nothing(tmp_path, monkeypatch):
 def test_code_digest_changes_with_any_source(tmp_path, monkeypatch):
     (tmp_path / "one" / "data").mkdir(parents=True)
     monkeypatch.setattr(module.resources, "files", lambda package: tmp_path / package)
-    monkeypatch.setattr(module, "PACKAGES", ("one",))
+    monkeypatch.setattr(module, "PRODUCT_PACKAGES", ("one",))
     found = set()
     for name, text in (("a.py", "1"), ("a.py", "2"), ("data/table.csv", "2"), ("b.py", "")):
         (tmp_path / "one" / name).write_text(text)
