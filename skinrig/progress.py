@@ -109,9 +109,9 @@ class Progress:
         self._printed_s = now
         stream = self.stream or sys.stderr
         if self.as_json:
-            left = None if left_s is None else round(left_s, 1)
+            rest = None if left_s is None else round(left_s, 1)
             line = json.dumps(
-                {"event": event, "seconds": round(seconds, 3), "text": self._text, "left_s": left}
+                {"event": event, "seconds": round(seconds, 3), "text": self._text, "left_s": rest}
             )
         else:
             still = "still at " if event == "running" else ""

@@ -1,9 +1,10 @@
 """Kill commands with SIGKILL at random moments, repeat them, and compare the bytes.
 
-Each command runs twice undisturbed. Then it is killed after seconds drawn uniformly up to half of
-the undisturbed run's, and repeated (`reconstruct`: the same command, `simulate`: with --resume) and
-killed until it ends. Its output is compared with the undisturbed one. Stages and tiles that begin
-again although they began before the kill are counted by the events of --json.
+Each command runs once undisturbed. Then it is killed, repeated (`reconstruct`: the same command,
+`simulate`: with --resume) and killed until it ends. The seconds from its first step to the kill are
+drawn uniformly up to half of the undisturbed run's. Its output is compared with the undisturbed
+one. Stages and tiles that begin again although they began before the kill are counted by the
+events of --json.
 
     skinrig demo --out DEMO
     python tools/judge_resume.py DEMO --kills 50 --out record.json
@@ -61,7 +62,7 @@ class Kill:
     command
         Name of the command.
     after_s, whole_s
-        Seconds from the start to the kill, and those of the undisturbed run.
+        Seconds from the first step to the kill, and those of the undisturbed run to its last step.
     same
         Whether the final output equals the undisturbed one.
     interrupted
@@ -103,12 +104,13 @@ def start(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
 
 
 def read_events(log: Path) -> list[tuple[str, float]]:
-    """Return text and seconds of the complete events in a file."""
+    """Return text and seconds of the beginnings of steps in a file."""
     events = []
     for line in log.read_text().splitlines():
         if line.startswith('{"event"') and line.endswith("}"):
             event = json.loads(line)
-            events.append((str(event["text"]), float(event["seconds"])))
+            if event["event"] == "progress":
+                events.append((str(event["text"]), float(event["seconds"])))
     return events
 
 
@@ -159,6 +161,8 @@ def kill_until_done(
     while code is None:
         after_s = float(rng.uniform(0.0, seconds / 2))
         process = start([*run, *(again if out.exists() else ())], log)
+        while process.poll() is None and not read_events(log):
+            time.sleep(0.02)
         try:
             code = process.wait(timeout=after_s)
         except subprocess.TimeoutExpired:
@@ -191,15 +195,11 @@ def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -
     undisturbed: dict[str, tuple[float, Mapping[str, str]]] = {}
     out = work / "out"
     for name, (run, _) in runs.items():
-        for _ in range(2):  # the first run may compile
-            shutil.rmtree(out, ignore_errors=True)
-            began = time.perf_counter()
-            if start([*run, "--out", str(out)], work / "whole").wait() != 0:
-                raise SystemExit((work / "whole").read_text())
-            hashes = hash_folder(out)
-            if name in undisturbed and undisturbed[name][1] != hashes:
-                raise SystemExit(f"{name}: two undisturbed runs differ")
-            undisturbed[name] = time.perf_counter() - began, hashes
+        log = work / "whole.log"
+        if start([*run, "--out", str(out)], log).wait() != 0:
+            raise SystemExit(log.read_text())
+        events = read_events(log)
+        undisturbed[name] = events[-1][1] - events[0][1], hash_folder(out)
         shutil.rmtree(out)
     for name in itertools.cycle(runs):
         if len(found) >= kills:
