@@ -35,7 +35,7 @@ from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console, EscapingFormatter, escape_controls
 from skinrig.next_steps import format_welcome
-from skinrig.progress import beat_while_running
+from skinrig.progress import beat_while_running, watch_start
 
 app = typer.Typer(
     name="skinrig",
@@ -201,6 +201,7 @@ def run() -> None:
     """Entry point of the console script."""
     signal.signal(signal.SIGTERM, _interrupt)
     kernel_cache.provide_kernel_cache(os.environ)
+    watch_start("--json" in sys.argv)
     sys.exit(main())
 
 

@@ -115,7 +115,7 @@ class Console:
 
     def print_line(self, text: str = "") -> None:
         """Print a line of text; the step of the progress ends."""
-        self._progress.end()
+        watch(None)
         if not self.quiet:
             stream = sys.stderr if self.as_json else sys.stdout
             print(escape_controls(text), file=stream, flush=True)

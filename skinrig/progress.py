@@ -83,10 +83,6 @@ class Progress:
             if self._text and now - self._printed_s >= BEAT_S:
                 self._print("running", now)
 
-    def end(self) -> None:
-        """Report the step no more: its result was printed."""
-        self._text = ""
-
     @staticmethod
     def _step(text: str) -> str:
         return _COUNTED.split(text)[0]
@@ -120,14 +116,19 @@ class Progress:
         print(line, file=stream, flush=True)
 
 
-_beating: list[Progress] = []
-"""Progress of the commands of this process, as far as they report steps."""
+_watched: list[Progress] = []
+"""Progress of the command that runs in this process; empty before its first step."""
 
 
-def watch(progress: Progress) -> None:
-    """Let the thread of `beat_while_running` report the steps of a command, too."""
-    if progress not in _beating:
-        _beating.append(progress)
+def watch(progress: Progress | None) -> None:
+    """Let `beat_while_running` report the steps of this progress, and of no other."""
+    _watched[:] = [] if progress is None else [progress]
+
+
+def watch_start(as_json: bool) -> None:
+    """Report the loading of libraries, if the first step comes late."""
+    now = time.perf_counter()
+    watch(Progress(as_json, now, _text="load the libraries", _printed_s=now))
 
 
 @contextmanager
@@ -137,7 +138,7 @@ def beat_while_running() -> Iterator[None]:
 
     def beat() -> None:
         while not ended.wait(1.0):
-            for progress in _beating:
+            for progress in tuple(_watched):
                 progress.beat()
 
     thread = threading.Thread(target=beat, daemon=True)
@@ -147,4 +148,4 @@ def beat_while_running() -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-        _beating.clear()
+        watch(None)

@@ -45,7 +45,6 @@ def report(
         Compare two runs side by side; default: if PATHS are exactly two of one kind.
     """
     from skinrig.atomic_file import write_atomically
-    from skinrig.reporting.report import build_any
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
@@ -53,6 +52,8 @@ def report(
     console = Console(json)
     talk = Console(json or piped)  # messages go to stderr if the page goes to stdout
     console.progress(f"draw the report of {format_count(len(paths), 'path')}")
+    from skinrig.reporting.report import build_any
+
     done = build_any(paths, compare=compare)
     if piped:
         typer.echo(done.html, nl=False)

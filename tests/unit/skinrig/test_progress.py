@@ -6,7 +6,7 @@ import pickle
 import time
 
 from skinrig.console import Console
-from skinrig.progress import BEAT_S, Progress, beat_while_running, watch
+from skinrig.progress import BEAT_S, Progress, beat_while_running, watch, watch_start
 
 
 class Clock:
@@ -55,9 +55,6 @@ def test_long_step_is_reported_again_with_less_left():
         clock.now += BEAT_S
         lines.beat()
     lines.beat()  # at once: nothing
-    lines.end()
-    clock.now += 100.0
-    lines.beat()
     assert stream.getvalue().splitlines()[1:] == [
         "[   4.0 s] still at chromophores (about 56 s left)",
         "[   8.0 s] still at chromophores (about 52 s left)",
@@ -75,9 +72,21 @@ def test_thread_beats_only_while_command_runs():
         while "still" not in stream.getvalue() and time.monotonic() < deadline:
             time.sleep(0.01)
         assert stream.getvalue().count("still at integrate") == 1
-    clock.now += BEAT_S
-    time.sleep(0)
+        watch(None)  # a result was printed
+        clock.now += BEAT_S
+        time.sleep(1.5)
     assert stream.getvalue().count("still at integrate") == 1
+
+
+def test_late_first_step_reports_loading(capsys, monkeypatch):
+    monkeypatch.setattr("skinrig.progress.BEAT_S", 0.0)
+    watch_start(True)
+    with beat_while_running():
+        time.sleep(1.5)
+        Console(True).print_line("done")
+    err = capsys.readouterr().err.splitlines()
+    assert json.loads(err[0])["text"] == "load the libraries"
+    assert err[-1] == "done"
 
 
 def test_console_json_progress_is_one_event_per_line(capsys):
