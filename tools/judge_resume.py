@@ -47,7 +47,10 @@ RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
 }
 """Session, calibration (empty: none) and maps of each rig in the folder of a demo."""
 SIMULATIONS: Mapping[str, Sequence[str]] = {
-    "simulate flash": ("flash", "--subject", "IV", "--width", "96"),
+    "simulate flash": (
+        *("flash", "--subject", "IV", "--width", "64"),
+        *("--omit", "lateral,interreflections,relief_shadows"),
+    ),
     "simulate probe": ("probe", "--subject", "homogeneous:0.08,1.2"),
 }
 """Arguments of `skinrig simulate`."""

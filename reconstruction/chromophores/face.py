@@ -254,13 +254,15 @@ def estimate_face(
         Called with the name of each long part and a function that returns its result; returns that
         result, which may have been kept from an earlier call.
     """
-    common = estimate_face_optics(rgb, table, prior=prior, has_white=has_white)
+    optics = partial(estimate_face_optics, rgb, table, prior=prior, has_white=has_white)
+    common = compute_part("common optics", optics)
     log_color = np.zeros(3) if common is None else common.log_color
     factor = np.exp(-log_color).astype(np.float32)
     errors: dict[str, Any] = {"variance": variance * factor**2, "model_error": model_error}
     exact, plain = with_exact_optics(table), rgb * factor
     known = partial(chromophore_posterior.estimate, plain, exact, prior=prior, **errors)
-    face = fit_with_white_reference(plain, exact, **errors) if has_white else None
+    fit = partial(fit_with_white_reference, plain, exact, **errors)
+    face = compute_part("face distribution", fit) if has_white else None
     found = by_face = alone = compute_part("face", lambda: known(face=face))
     spots = np.zeros(rgb.shape[:-1], bool)
     if face is not None:
