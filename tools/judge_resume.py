@@ -95,6 +95,25 @@ def hash_folder(folder: Path) -> dict[str, str]:
     }
 
 
+def hash_outputs(out: Path) -> dict[str, str]:
+    """Hash an output folder, or the plan and frames of a session and its ground truth's images.
+
+    Documents of a session and its truth contain the time of the capture.
+    """
+    truth = out.with_name(f"truth-{out.name}")
+    if not truth.is_dir():
+        return hash_folder(out)
+    found = hash_folder(out / "frames")
+    images = {name: digest for name, digest in hash_folder(truth).items() if ".exr" in name}
+    return found | {f"truth {name}": digest for name, digest in images.items()}
+
+
+def remove_outputs(out: Path) -> None:
+    """Remove an output folder, and the ground truth of a session."""
+    for folder in (out, out.with_name(f"truth-{out.name}")):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def start(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
     """Start skinrig with --json; its events go to a file."""
     with open(log, "wb") as stream:
@@ -172,9 +191,9 @@ def kill_until_done(
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         kills.append((after_s, read_events(log)))
-    same = code == 0 and hash_folder(out) == expected
+    same = code == 0 and hash_outputs(out) == expected
     same &= not list(out.parent.glob(f".{out.name}.*"))
-    shutil.rmtree(out, ignore_errors=True)
+    remove_outputs(out)
     return [
         Kill(name, after_s, seconds, same, *count_repeated(before, after))
         for (after_s, before), (_, after) in pairwise(kills)
@@ -202,8 +221,8 @@ def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -
         if start([*run, "--out", str(out)], log).wait() != 0:
             raise SystemExit(log.read_text())
         events = read_events(log)
-        undisturbed[name] = events[-1][1] - events[0][1], hash_folder(out)
-        shutil.rmtree(out)
+        undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
+        remove_outputs(out)
     for name in itertools.cycle(runs):
         if len(found) >= kills:
             break
