@@ -2,7 +2,7 @@
 
 Each command runs once undisturbed. Then it is killed, repeated (`reconstruct`: the same command,
 `simulate`: with --resume) and killed until it ends. The seconds from its first step to the kill are
-drawn uniformly up to half of the undisturbed run's. Its output is compared with the undisturbed
+drawn uniformly up to --span of the undisturbed run's. Its output is compared with the undisturbed
 one. Stages and tiles that begin again although they began before the kill are counted by the
 events of --json.
 
@@ -174,6 +174,7 @@ def kill_until_done(
     whole: tuple[float, Mapping[str, str]],
     rng: np.random.Generator,
     again: Sequence[str] = (),
+    span: float = 0.5,
 ) -> list[Kill]:
     """Kill a command at random moments and repeat it until it ends; compare its output."""
     seconds, expected = whole
@@ -181,7 +182,7 @@ def kill_until_done(
     kills: list[tuple[float, list[tuple[str, float]]]] = []
     code = None
     while code is None:
-        after_s = float(rng.uniform(0.0, seconds / 2))
+        after_s = float(rng.uniform(0.0, span * seconds))
         process = start([*run, *(again if out.exists() else ())], log)
         while process.poll() is None and not read_events(log):
             time.sleep(0.02)
@@ -200,7 +201,9 @@ def kill_until_done(
     ]
 
 
-def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -> list[Kill]:
+def judge(
+    demo: Path, work: Path, names: Sequence[str], kills: int, seed: int, span: float = 0.5
+) -> list[Kill]:
     """Kill each command in turn until there are enough kills; print each outcome."""
     rng = np.random.default_rng(seed)
     runs: dict[str, tuple[list[str], tuple[str, ...]]] = {}
@@ -228,7 +231,9 @@ def judge(demo: Path, work: Path, names: Sequence[str], kills: int, seed: int) -
             break
         run, again = runs[name]
         given_out = [*run, "--out", str(out)]
-        chain = kill_until_done(name, given_out, out, whole=undisturbed[name], rng=rng, again=again)
+        chain = kill_until_done(
+            name, given_out, out, whole=undisturbed[name], rng=rng, again=again, span=span
+        )
         found += chain
         for kill in chain:
             print(json.dumps(asdict(kill)), flush=True)
@@ -241,12 +246,13 @@ def main() -> int:
     parser.add_argument("demo", type=Path, help="folder of `skinrig demo`")
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--span", type=float, default=0.5, help="latest kill, over the run's time")
     parser.add_argument("--commands", default=",".join([*RECONSTRUCTIONS, *SIMULATIONS]))
     parser.add_argument("--work", type=Path, required=True, help="new folder for outputs")
     given = parser.parse_args()
     given.work.mkdir(parents=True)
     names = given.commands.split(",")
-    found = judge(given.demo, given.work, names, given.kills, given.seed)
+    found = judge(given.demo, given.work, names, given.kills, given.seed, given.span)
     print("command, kills, same bytes, interrupted parts, complete parts again, their seconds")
     for name in names:
         own = [kill for kill in found if kill.command == name]
