@@ -5,9 +5,10 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.main import get_command
@@ -34,6 +35,7 @@ from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console, EscapingFormatter, escape_controls
 from skinrig.next_steps import format_welcome
+from skinrig.progress import beat_while_running, watch_start
 
 app = typer.Typer(
     name="skinrig",
@@ -135,6 +137,10 @@ analysing.analyse_app.command("albedo", cls=Command)(editing.analyse_albedo)
 app.add_typer(analysing.analyse_app, name="analyse")
 
 
+WAITING_COMMANDS: Final = frozenset({"capture", "serve"})
+"""Commands that wait for people and other programs: their steps are not reported again."""
+
+
 @cache
 def _build_commands() -> Any:
     """Build the tree of all commands, which takes 30 ms, once per process."""
@@ -148,7 +154,8 @@ def main(argv: list[str] | None = None) -> int:
         return errors.EXIT_DONE
     given = sys.argv[1:] if argv is None else argv
     try:
-        result = _build_commands()(args=argv, standalone_mode=False)
+        with nullcontext() if {*given} & WAITING_COMMANDS else beat_while_running():
+            result = _build_commands()(args=argv, standalone_mode=False)
     except (typer.Exit, SystemExit) as stop:
         code = getattr(stop, "exit_code", None)
         return int(code if code is not None else getattr(stop, "code", 0) or 0)
@@ -196,6 +203,7 @@ def run() -> None:
     """Entry point of the console script."""
     signal.signal(signal.SIGTERM, _interrupt)
     kernel_cache.provide_kernel_cache(os.environ)
+    watch_start("--json" in sys.argv)
     sys.exit(main())
 
 

@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from skinrig.progress import Progress, watch
+
 
 def to_json_value(value: Any) -> Any:
     """Convert a value to JSON types; NaN and infinities become None.
@@ -101,17 +103,36 @@ class Console:
     quiet: bool = False
     """Whether only progress is printed: the caller prints its own summary."""
     started_s: float = field(default_factory=time.perf_counter)
+    _progress: Progress = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Begin the progress of the command."""
+        self._progress = Progress(self.as_json, self.started_s)
+
+    def __reduce__(self) -> tuple[type, tuple[bool, bool, float]]:
+        """Let another process continue with its own progress."""
+        return type(self), (self.as_json, self.quiet, self.started_s)
 
     def print_line(self, text: str = "") -> None:
-        """Print a line of text."""
+        """Print a line of text; the step of the progress ends."""
+        watch(None)
         if not self.quiet:
             stream = sys.stderr if self.as_json else sys.stdout
             print(escape_controls(text), file=stream, flush=True)
 
-    def progress(self, text: str) -> None:
-        """Print a line of progress with the time since the command's start, s."""
-        seconds = time.perf_counter() - self.started_s
-        print(f"[{seconds:6.1f} s] {escape_controls(text)}", file=sys.stderr, flush=True)
+    def progress(self, text: str, left_s: float | None = None) -> None:
+        """Print progress on stderr: a line of text, or with --json an event.
+
+        Parameters
+        ----------
+        text
+            Step that begins; for one part of several with "number/count". Lines about parts of
+            the same step are not printed more often than every few seconds; events always are.
+        left_s
+            Estimated seconds that are left; None: by the pace of counted parts, or unknown.
+        """
+        watch(self._progress)
+        self._progress.begin(escape_controls(text), left_s)
 
     def print_table(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
         """Print a table with aligned columns; NaN is printed as a dash."""

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from skinrig.console import Console, to_json_value
 from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
+from skinrig.progress import beat_while_running
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
 
@@ -51,8 +53,6 @@ in the report while the other rigs run.
 REPORT_NAME = "report.html"
 RELOAD_S = 10
 """Seconds after which a browser loads a preliminary report again."""
-SLEEPING_THREADS = {**PASSIVE_WAIT_SETTINGS, "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of parallel rigs, unless the user has set it: the rigs share the cores."""
 SecondsByStep = dict[str, float]
 
 
@@ -205,7 +205,7 @@ def _run_in_processes(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )
     try:
-        with _environment(SLEEPING_THREADS):  # the pool starts its processes on submission
+        with _environment(PASSIVE_WAIT_SETTINGS):  # the pool starts its processes on submission
             futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
         for done in as_completed(futures):
             yield futures[done], done.result()
@@ -240,7 +240,9 @@ def _run_rig(
 ) -> tuple[DemoResults, SecondsByStep]:
     found = DemoResults()
     shares: SecondsByStep = {}
-    RIGS[rig](RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found))
+    with beat_while_running():
+        timer = partial(_time_step, seconds=shares, console=console)
+        RIGS[rig](RigDemo(out, seed, timer, width_px, found))
     return found, shares
 
 

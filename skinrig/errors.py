@@ -184,6 +184,8 @@ def format_interruption(given: Sequence[str]) -> str:
     kept = any(word == "--out" or word.startswith("--out=") for word in given)
     if command == "bench" and kept and "--extremes" not in given:
         return "interrupted; bench.json in --out keeps what was measured"
+    if command == "reconstruct":
+        return "interrupted; run the same command again: it takes up the finished stages"
     return "interrupted; run the same command again"
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 
 PACKAGES_FOLDER = Path(__file__).parent.parent
 """Folder in which the packages are installed."""
-PASSIVE_WAIT_SETTINGS = {"OMP_WAIT_POLICY": "PASSIVE"}
+PASSIVE_WAIT_SETTINGS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 """Let waiting threads sleep: spinning ones occupy cores that other processes could use. OpenMP
-reads the variable when it is loaded, before the first parallel loop."""
+reads the variable when it is loaded, before the first parallel loop. With several threads of
+OpenBLAS, which also spin, the last digits of two equal runs differ."""
 
 
 def find_user_cache(environment: Mapping[str, str]) -> Path:
@@ -98,7 +99,7 @@ def set_passive_waiting(environment: MutableMapping[str, str]) -> None:
     'PASSIVE'
     >>> set_passive_waiting(asked := {"OMP_WAIT_POLICY": "ACTIVE"})
     >>> asked
-    {'OMP_WAIT_POLICY': 'ACTIVE'}
+    {'OMP_WAIT_POLICY': 'ACTIVE', 'OPENBLAS_NUM_THREADS': '1'}
     """
     for name, value in PASSIVE_WAIT_SETTINGS.items():
         environment.setdefault(name, value)

@@ -6,6 +6,7 @@
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -238,6 +239,7 @@ def estimate_face(
     variance: FloatArray,
     model_error: FloatArray,
     has_white: bool,
+    compute_part: Callable[[str, Callable[[], Any]], Any] = lambda _, compute: compute(),
 ) -> FaceEstimate:
     """Estimate melanin and hemoglobin of every pixel of one face.
 
@@ -248,25 +250,36 @@ def estimate_face(
     has_white
         Whether a white reference at the face's position fixes the exposure. Without it the face
         distribution adds no information.
+    compute_part
+        Called with the name of each long part and a function that returns its result; returns that
+        result, which may have been kept from an earlier call.
     """
-    common = estimate_face_optics(rgb, table, prior=prior, has_white=has_white)
+    optics = partial(estimate_face_optics, rgb, table, prior=prior, has_white=has_white)
+    common = compute_part("common optics", optics)
     log_color = np.zeros(3) if common is None else common.log_color
     factor = np.exp(-log_color).astype(np.float32)
     errors: dict[str, Any] = {"variance": variance * factor**2, "model_error": model_error}
     exact, plain = with_exact_optics(table), rgb * factor
     known = partial(chromophore_posterior.estimate, plain, exact, prior=prior, **errors)
-    face = fit_with_white_reference(plain, exact, **errors) if has_white else None
-    found = by_face = alone = known(face=face)
+    fit = partial(fit_with_white_reference, plain, exact, **errors)
+    face = compute_part("face distribution", fit) if has_white else None
+    found = by_face = alone = compute_part("face", lambda: known(face=face))
     spots = np.zeros(rgb.shape[:-1], bool)
     if face is not None:
-        alone = known()
+        alone = compute_part("single pixels", known)
         spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
         if rgb.ndim == 3:
             spots |= dark_spots.is_locally_dark(plain, variance=errors["variance"])
         found = dark_spots.average_hypotheses(by_face, alone, spots)
     if common is not None:
-        found = add_optics_errors(
-            found, rgb, table, common, variance=variance, model_error=model_error
+        found = compute_part(
+            "errors by optics",
+            partial(
+                add_optics_errors,
+                *(found, rgb, table, common),
+                variance=variance,
+                model_error=model_error,
+            ),
         )
     return FaceEstimate(found, by_face, face, spots, common, alone.shading)
 

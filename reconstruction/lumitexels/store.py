@@ -7,7 +7,8 @@ the chunks of a small surface, which every estimate reads.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,6 +35,16 @@ MAX_CACHED_BYTES: Final = 2**28
 """Up to this size chunks are cached for the next estimate, unless the tables are on disk."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewSamples:
+    """Samples of all images of one camera, as `LumitexelStore` keeps them."""
+
+    table: NDArray[Any] | None
+    """(L, 2, rows, 3): signal and its standard error over ``scale``; None: in the folder."""
+    scale: Float32Array
+    """(L, 2)."""
+
+
 class LumitexelStore:
     """Lumitexels of a surface, filled image by image.
 
@@ -54,7 +65,8 @@ class LumitexelStore:
     light_radius_mm, offset_mm : float
         See `reconstruction.lumitexels.compute_visibility`.
     folder : Path, optional
-        Existing folder for the tables; in memory by default.
+        Existing folder for the tables; in memory by default. Tables of an equal store in it keep
+        their content.
     dtype : dtype
         Type of the tables. float16 resolves 0.05 %, well below the noise of a sample, of values
         that are scaled row by row.
@@ -90,7 +102,8 @@ class LumitexelStore:
         self._lit = np.packbits(seen.light, axis=0, bitorder="little")  # (L / 8, P)
         self._rows = [np.flatnonzero(row).astype(np.int32) for row in seen.view]
         self._scale = np.zeros((len(cameras), self.light_count, 2), np.float32)
-        self._kept_bytes = MAX_CACHED_BYTES if folder is None else 0
+        self._on_disk = folder is not None
+        self._kept_bytes = 0 if self._on_disk else MAX_CACHED_BYTES
         self._kept: dict[tuple[int, int], Lumitexels] = {}
         self._tables = [
             _table(folder, view, (self.light_count, 2, len(rows), 3), np.dtype(dtype))
@@ -152,6 +165,20 @@ class LumitexelStore:
             top = float(np.max(values, where=np.isfinite(values), initial=0.0))
             self._scale[view, light, kind] = top if top > 0 else 1.0
         self._tables[view][light] = row / self._scale[view, light, :, None, None]
+
+    def view_samples(self, view: int) -> ViewSamples:
+        """Return the samples of one camera; do not modify them. Tables on disk are flushed."""
+        table = self._tables[view]
+        if isinstance(table, np.memmap):
+            table.flush()
+        return ViewSamples(None if self._on_disk else table, self._scale[view].copy())
+
+    def put_view(self, view: int, samples: ViewSamples) -> None:
+        """Replace the samples of one camera by those of `view_samples` of an equal store."""
+        self._kept.clear()
+        if samples.table is not None and samples.table is not self._tables[view]:
+            self._tables[view][...] = samples.table
+        self._scale[view] = samples.scale
 
     def chunks(self, size: int) -> Iterator[tuple[slice, Lumitexels]]:
         """Yield the lumitexels of all points, at most `size` at a time (about 60 B per sample)."""
@@ -240,14 +267,16 @@ class LumitexelStore:
 def _table(
     folder: Path | None, view: int, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> NDArray[Any]:
-    """Return a table of NaN; on disk it is sparse until it is written."""
+    """Return a table of NaN; on disk it is sparse until it is written, or an earlier one."""
     if folder is None or 0 in shape:
         return np.full(shape, np.nan, dtype)
-    table = np.lib.format.open_memmap(
-        folder / f"view{view:03d}.npy", mode="w+", dtype=dtype, shape=shape
-    )
+    path = folder / f"view{view:03d}.npy"
     # a row that is never written has scale 0, which _assemble masks
-    return table
+    with suppress(OSError, ValueError):  # of another store, or cut
+        found = np.lib.format.open_memmap(path, mode="r+")
+        if found.shape == shape and found.dtype == dtype:
+            return found
+    return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
 
 
 def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> Float64Array | None:

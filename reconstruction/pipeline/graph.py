@@ -5,9 +5,13 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
+
+from reconstruction.pipeline.checkpoints import Checkpoints
+from reconstruction.pipeline.run_progress import RunProgress
 
 
 class StageError(ValueError):
@@ -167,12 +171,13 @@ def run_stages(
     want: Sequence[str],
     *,
     cache: MutableMapping[str, Mapping[str, Any]] | None = None,
-    progress: Callable[[str], None] | None = None,
+    checkpoints: Checkpoints | None = None,
+    progress: RunProgress | None = None,
 ) -> RunResult:
     """Compute the wanted products, and only the stages that they need.
 
     A stage is skipped when its input hash is in the cache; stages that only it needs are skipped
-    too.
+    too. A stage that an interrupted run finished counts as run, as if nothing had interrupted it.
 
     Parameters
     ----------
@@ -183,8 +188,10 @@ def run_stages(
     cache
         Products kept from earlier runs, by the input hash of their stage; all of a stage's
         products or some. New products are added.
+    checkpoints
+        Stages and tiles that an interrupted run finished; the others are added. None: none.
     progress
-        Called with a line of text before each stage that runs.
+        Receives the names of the stages that run, and the beginning of each.
 
     Returns
     -------
@@ -199,41 +206,74 @@ def run_stages(
         if stage.refused and keys[stage.name] not in cache:
             raise StageError(stage.refused)
     products: dict[str, Any] = {}
-    ran: list[str] = []
+    running: list[PipelineStage] = []
     reused: list[str] = []
+    settled: set[str] = set()
 
-    def provide(product: str) -> None:
-        if product in products:
+    def settle(product: str) -> None:
+        """Take a product from the cache, or list its stage after those that it needs."""
+        if product in settled:
             return
         stage = made_by[product]
         kept = cache.get(keys[stage.name], {})
         if product in kept:
             products.update({name: kept[name] for name in kept if name not in products})
+            settled.update(kept)
             if stage.name not in reused:
                 reused.append(stage.name)
             return
         for needed_product in stage.needs:
-            provide(needed_product)
-        if progress is not None:
-            progress(stage.name)
-        made = stage.run(**{product: products[product] for product in stage.needs})
-        if set(made) != set(stage.makes):
-            both = f"made {sorted(made)}, expected {sorted(stage.makes)}"
-            raise StageError(f"stage {stage.name}: {both}; correct its makes or its run")
-        products.update(made)
-        ran.append(stage.name)
+            settle(needed_product)
+        running.append(stage)
+        settled.update(stage.makes)
         # the cache can hold a stage's maps but lack the products that only other stages need
         if stage.name in reused:
             reused.remove(stage.name)
-        cache[keys[stage.name]] = made
+        for name in stage.makes:
+            products.pop(name, None)
+
+    def provide(product: str) -> Any:
+        """Return a product; one of a finished stage is loaded when it is needed."""
+        if product not in products:
+            stage = made_by[product]
+            found = checkpoints.load(keys[stage.name]) if checkpoints is not None else None
+            products.update(run(stage, again=True) if found is None else found)
+        return products[product]
+
+    def run(stage: PipelineStage, *, again: bool = False) -> Mapping[str, Any]:
+        needed = {product: provide(product) for product in stage.needs}
+        if progress is not None:
+            progress.begin_stage(stage.name)
+        call = partial(_run_stage, stage, needed)
+        if checkpoints is None:
+            return call()
+        compute = checkpoints.compute_again if again else checkpoints.compute
+        return compute(keys[stage.name], call)
 
     for product in want:
+        settle(product)
+    todo = [s for s in running if checkpoints is None or not checkpoints.recall(keys[s.name])]
+    if progress is not None:
+        progress.plan(stage.name for stage in todo)
+    for stage in todo:
+        made = cache[keys[stage.name]] = run(stage)
+        products.update(made)
+    for product in want:
         provide(product)
+    ran = [stage.name for stage in running]
     left_out = [(s.name, "no wanted product depends on it") for s in stages if s not in needed]
     idle = [s.name for s in needed if s.name not in ran and s.name not in reused]
     left_out += [(name, "the stages that depend on it were reused") for name in idle]
     wanted = {product: products[product] for product in want}
     return RunResult(wanted, tuple(ran), tuple(reused), tuple(left_out), keys)
+
+
+def _run_stage(stage: PipelineStage, needed: Mapping[str, Any]) -> Mapping[str, Any]:
+    made = stage.run(**needed)
+    if set(made) != set(stage.makes):
+        both = f"made {sorted(made)}, expected {sorted(stage.makes)}"
+        raise StageError(f"stage {stage.name}: {both}; correct its makes or its run")
+    return made
 
 
 def record_run(

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
+from reconstruction.pipeline.checkpoints import Checkpoints, RunRecord, compute_tiles
 from reconstruction.pipeline.graph import PipelineStage, make_stage_factory
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
+from reconstruction.pipeline.run_progress import RunProgress
 
-PROGRESS_INTERVAL_S = 5.0
-"""Seconds between two progress lines of the same stage."""
+Result = TypeVar("Result")
+Tile = TypeVar("Tile")
 
 
 class InputsError(ValueError):
@@ -68,7 +70,9 @@ class Inputs:
     noted
         JSON values for the record of the maps.
     progress
-        Called with a line of text while a stage runs.
+        Receives the beginning of each stage and tile.
+    checkpoints
+        Stages and tiles of an interrupted run; None: nothing is stored.
     """
 
     session: Session
@@ -84,15 +88,58 @@ class Inputs:
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
-    progress: Callable[[str], None] | None = None
-    _reported_at: float = 0.0
+    progress: RunProgress = field(default_factory=RunProgress)
+    checkpoints: Checkpoints | None = None
 
-    def report_progress(self, stage: str, done: float) -> None:
-        """Report a stage's progress, 0 to 1, at most once per `PROGRESS_INTERVAL_S`."""
-        now = time.monotonic()
-        if self.progress is not None and now - self._reported_at >= PROGRESS_INTERVAL_S:
-            self._reported_at = now
-            self.progress(f"{stage}: {100 * done:.0f} %")
+    def compute_tiles(
+        self, stage: str, tiles: Sequence[Tile], compute: Callable[[Tile], Result]
+    ) -> Iterator[Result]:
+        """Yield the result of each tile in order, report progress, and store the results.
+
+        Parameters
+        ----------
+        stage
+            Name of this pass over the tiles, unique within the stage.
+        tiles
+            Arguments of ``compute``.
+        compute
+            Without effect but its result, which depends on nothing but the stage's inputs.
+        """
+        report = self.progress.begin_tile
+        return compute_tiles(self.checkpoints, stage, tiles, compute, report)
+
+    def compute_part(self, name: str, compute: Callable[[], Result]) -> Result:
+        """Return the result of one part of a stage, see `compute_tiles`."""
+        return next(self.compute_tiles(name, [None], lambda _: compute()))
+
+    def scratch_folder(self, name: str) -> tuple[Path, object]:
+        """Return a folder for a stage's tables, and an object that keeps it until it is freed."""
+        if self.checkpoints is not None:
+            return self.checkpoints.scratch_folder(name), None
+        folder = tempfile.TemporaryDirectory(prefix="skinrig-")
+        return Path(folder.name), folder
+
+    def record(self) -> RunRecord:
+        """Return the record that stages extend."""
+        return RunRecord(self.assumed, self.noted, self.hashes)
+
+    def options(self) -> dict[str, Any]:
+        """Return inputs and options that products depend on, as JSON values."""
+        folder = self.calibration
+        files = [] if folder is None else [folder / f"{kind}.json" for kind in CALIBRATION_KINDS]
+        return {
+            "hashes": dict(self.hashes),
+            "calibrations": {
+                path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+                for path in files
+                if path.is_file()
+            },
+            "state": self.state,
+            "on_date": self.on_date.isoformat(),
+            "rank": self.rank,
+            "held_out": self.hold_out.record(),
+            "repeat": self.repeat,
+        }
 
     @staticmethod
     def of(

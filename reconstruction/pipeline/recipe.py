@@ -1,7 +1,7 @@
 """Recipe of a rig kind: its maps, files and graph of stages."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from capture.session import Session
 from reconstruction.pipeline import graph as stages
@@ -23,6 +23,8 @@ class Recipe:
     """Products by name, where a name means several, as one map for each state."""
     maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
     """Names of the maps for a number of basis BRDFs; None: this rig kind fits none."""
+    typical_seconds: Mapping[str, float] = field(default_factory=dict)
+    """Processor seconds of the long stages at demo size, by the first word of their names."""
 
     def expand(self, session: Session, want: Sequence[str]) -> list[str]:
         """Expand the wanted names to the maps and files that they mean."""

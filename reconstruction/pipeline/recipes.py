@@ -14,8 +14,10 @@ from model import store
 from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.checkpoints import Checkpoints
 from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
 from reconstruction.pipeline.recipe import Recipe
+from reconstruction.pipeline.run_progress import RunProgress
 
 
 def light_list_recipe() -> Recipe:
@@ -59,9 +61,12 @@ def reconstruct(
     landmarks: str | Path | None = None,
     dome: DomeOptions | None = None,
     truth: str = "",
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str, float | None], None] | None = None,
 ) -> stages.RunResult:
     """Compute the wanted maps of a session and write them to an APPEARANCE/ folder.
+
+    Finished stages are kept in a work folder until the maps are written: the same call resumes an
+    interrupted one, see `reconstruction.pipeline.checkpoints`.
 
     Parameters
     ----------
@@ -85,7 +90,8 @@ def reconstruct(
     truth
         Name of the TRUTH/ folder in the same parent folder as ``out``, for the report.
     progress
-        Called with one line before each stage that runs.
+        Called with a line of text and the estimated seconds that are left, None where unknown,
+        before each stage and each tile that is computed.
 
     Returns
     -------
@@ -97,6 +103,8 @@ def reconstruct(
     InputsError, stages.StageError, SessionError, CalibrationError
         When frames are missing, a wanted map is unknown, or a file is damaged, of another rig
         or out of date.
+    BusyError
+        When another process computes the same maps.
     """
     opened = Session.open(session)
     recipe = recipe_for_session(opened)
@@ -112,25 +120,34 @@ def reconstruct(
     inputs = Inputs.of(
         opened, calibration, state=state, on_date=on_date, landmarks=landmarks, dome=options
     )
-    inputs.progress = progress
+    inputs.progress = RunProgress(progress, recipe.typical_seconds)
     graph = recipe.graph(inputs)
     products = _planned_products(graph, recipe, opened, want)
     previous = _Previous.of(Path(out))
     held = previous.current_products(graph)
     kept = {previous.keys[name]: contents for name, contents in held.items()}
-    outcome = stages.run_stages(graph, products, cache=kept, progress=progress)
-    work = stages.record_run(graph, outcome, {name: previous.keys[name] for name in held})
-    outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
-    # consent must go with the maps wherever they are copied
-    consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
-    current = previous.exists and previous.parameters.get("consent", []) == consent
-    if not outcome.ran and current and set(products) <= set(previous.contents):
-        return outcome
-    named = {"kind": "appearance", "session": Path(session).name, "state": state, "truth": truth}
-    made = {name: outcome.products[name] for name in products}
-    store.write(
-        out, _appearance(inputs, graph, outcome, made, previous, {**named, "consent": consent})
-    )
+    with Checkpoints.of_output(Path(out), inputs.options(), inputs.record()) as checkpoints:
+        inputs.checkpoints = checkpoints
+        outcome = stages.run_stages(
+            graph, products, cache=kept, checkpoints=checkpoints, progress=inputs.progress
+        )
+        work = stages.record_run(graph, outcome, {name: previous.keys[name] for name in held})
+        outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
+        # consent must go with the maps wherever they are copied
+        consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
+        current = previous.exists and previous.parameters.get("consent", []) == consent
+        if not outcome.ran and current and set(products) <= set(previous.contents):
+            return outcome
+        named = {
+            "kind": "appearance",
+            "session": Path(session).name,
+            "state": state,
+            "truth": truth,
+        }
+        made = {name: outcome.products[name] for name in products}
+        store.write(
+            out, _appearance(inputs, graph, outcome, made, previous, {**named, "consent": consent})
+        )
     return outcome
 
 

@@ -62,6 +62,7 @@ def calibrate(
 
     console = Console(json)
     (kind,) = replace_former_values([kind], FORMER_NAMES)
+    console.progress(f"calibrate {kind} from {format_count(len(sessions), 'session')}")
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
     rows = [(name.replace("_", " "), value) for name, value in done.summary]
     console.print_table(("quantity", "value"), rows)

@@ -15,7 +15,7 @@ from skinrig.commands.options import (
     check_output_page,
     command,
 )
-from skinrig.console import Console, select_attributes
+from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import EXIT_LIMIT_MISSED, UnusableError, UsageError
 
 MAX_PORT = 65_535
@@ -54,13 +54,15 @@ def report(
         Compare two runs side by side; default: if PATHS are exactly two of one kind.
     """
     from skinrig.atomic_file import write_atomically
-    from skinrig.reporting.report import build_any
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
         raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)
     talk = Console(json or piped)  # messages go to stderr if the page goes to stdout
+    console.progress(f"draw the report of {format_count(len(paths), 'path')}")
+    from skinrig.reporting.report import build_any
+
     done = build_any(paths, compare=compare)
     if piped:
         typer.echo(done.html, nl=False)

@@ -28,7 +28,7 @@ def analyze_portrait(
     *,
     width_px: int,
     subject: SubjectRecord,
-    progress: Callable[[str], None],
+    progress: Callable[..., None],
 ) -> Portrait:
     """Find the face of a photograph, estimate its chromophores, and write a report.
 

@@ -10,7 +10,8 @@ from skinrig.errors import MissingExtra
 FRACTION_PATTERN: Final = re.compile(r"\b(\d+)/(\d+)\b")
 PERCENT_PATTERN: Final = re.compile(r"\b(\d+) %")
 """Progress in a line: 3/40 frames, or 25 % of a stage."""
-Report = Callable[[str], None]
+Report = Callable[..., None]
+"""Called with a line, and the seconds that are left or None."""
 
 
 def parse_progress(line: str) -> tuple[int, int] | None:
@@ -55,7 +56,7 @@ def show_progress(title: str, wanted: bool) -> Iterator[Report | None]:
         raise MissingExtra("a progress bar (or give progress=False)", "notebook") from error
     with tqdm(desc=title, leave=False, mininterval=0) as bar:
 
-        def report(line: str) -> None:
+        def report(line: str, left_s: float | None = None) -> None:
             found = parse_progress(line)
             if found is None:
                 bar.set_postfix_str(line)

@@ -310,6 +310,8 @@ def drive_plan(
             **run,
         )
         session.close()
+        if order.progress is not None:
+            order.progress("compute the ground truth")
         return float(world.now)
     finally:
         for camera in cameras.values():

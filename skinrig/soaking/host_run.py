@@ -57,7 +57,7 @@ class SimulatedInterrupt(KeyboardInterrupt):
 class SilentConsole(Console):
     """A console that prints no progress."""
 
-    def progress(self, text: str) -> None:
+    def progress(self, text: str, left_s: float | None = None) -> None:
         """Print nothing."""
 
 

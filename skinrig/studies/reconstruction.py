@@ -37,7 +37,7 @@ class ReconstructionSummary:
 
 
 def reconstruct_session(
-    order: ReconstructionOrder, progress: Callable[[str], None] | None = None
+    order: ReconstructionOrder, progress: Callable[[str, float | None], None] | None = None
 ) -> ReconstructionSummary:
     """Reconstruct one session into its folder.
 
@@ -46,7 +46,7 @@ def reconstruct_session(
     order
         Session, maps and folders.
     progress
-        Called with one line before each stage that runs.
+        Called before each stage or part that runs, with one line and the seconds left, if known.
     """
     done = recipes.reconstruct(
         order.session,
@@ -63,7 +63,10 @@ def reconstruct_session(
 
 
 def reconstruct_sessions(
-    orders: Sequence[ReconstructionOrder], *, executor: str, progress: Callable[[str], None]
+    orders: Sequence[ReconstructionOrder],
+    *,
+    executor: str,
+    progress: Callable[[str, float | None], None],
 ) -> Iterator[ReconstructionSummary]:
     """Yield the summary of each session, in order.
 
@@ -85,13 +88,13 @@ def reconstruct_sessions(
         if pool is None:
             for order in orders:
                 if len(orders) > 1:
-                    progress(str(order.session))
+                    progress(str(order.session), None)
                 yield reconstruct_session(order, progress)
             return
         made = map_tiles(reconstruct_session, orders, executor=pool, window=max(len(orders), 1))
         try:
             for number, summary in enumerate(made):
-                progress(f"session {number + 1} of {len(orders)}: {orders[number].session}")
+                progress(f"session {number + 1} of {len(orders)}: {orders[number].session}", None)
                 yield summary
         except CancelledError as error:
             raise ExecutorLost(

@@ -1,8 +1,9 @@
 """Calibrated or nominal dome, with its images."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,8 @@ class CalibratedDome:
     """Response of each camera at the pixels of its images, (h, w, 3)."""
     absolute: bool
     """Whether the lights' intensities are calibrated, so that the albedo has a scale."""
-    report_progress: Callable[[str, float], None]
-    """Reports a stage's progress, 0 to 1."""
+    compute_tiles: Callable[..., Iterator[Any]]
+    """See `reconstruction.pipeline.inputs.Inputs.compute_tiles`."""
 
     @property
     def pixel_mm(self) -> float:
@@ -116,9 +117,7 @@ def load_dome(inputs: Inputs, images: DomeImages) -> CalibratedDome:
         inputs.noted["lights_left_out"] = dead
     response = tuple(_response(lights, camera) for camera in cameras)
     absolute = lit is not None and "intensities" not in nominal
-    return CalibratedDome(
-        images, cameras, lights, lights, response, absolute, inputs.report_progress
-    )
+    return CalibratedDome(images, cameras, lights, lights, response, absolute, inputs.compute_tiles)
 
 
 def split_exposures(dome: CalibratedDome) -> CalibratedDome:

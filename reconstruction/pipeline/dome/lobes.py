@@ -14,7 +14,7 @@ from model.checks import Checks
 from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
-from reconstruction.arrays import Float64Array
+from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline.dome.calibrated import CalibratedDome
@@ -65,31 +65,38 @@ class SurfaceSampleStore:
     folder: Any
     lights: int
     """Number of the dome's lights; where exposures are separate, several captures share one."""
-    report_progress: Callable[[str, float], None]
-    """Reports a stage's progress, 0 to 1."""
+    compute_tiles: Callable[..., Iterator[Any]]
+    """See `reconstruction.pipeline.inputs.Inputs.compute_tiles`."""
 
-    def chunks(self) -> Iterator[tuple[slice, Lumitexels]]:
-        """Yield parts of the points with their samples, at most `CHUNK_SAMPLES` each."""
+    def parts(self) -> list[slice]:
+        """Return parts of the points with at most `CHUNK_SAMPLES` samples each."""
         samples_per_point = max(self.store.light_count * self.store.view_count, 1)
-        return self.store.chunks(max(1, CHUNK_SAMPLES // samples_per_point))
+        size = max(1, CHUNK_SAMPLES // samples_per_point)
+        total = len(self.store.surface)
+        return [slice(start, min(start + size, total)) for start in range(0, total, size)]
+
+    def samples(self, part: slice) -> Lumitexels:
+        """Return the samples of a part."""
+        return self.store.chunk(part.start, part.stop)
 
     def collect(
         self, stage: str, estimate: Callable[[slice, Lumitexels], PointValues]
     ) -> PointValues:
-        """Estimate chunk by chunk and concatenate the results.
+        """Estimate part by part and concatenate the results.
 
         Parameters
         ----------
         stage
-            Name of the stage, for progress lines.
+            Name of this pass, unique within the stage.
         estimate
-            Called with the points of a chunk and their samples.
+            Called with the points of a part and their samples.
         """
-        parts = []
-        for part, samples in self.chunks():
-            by_light = dataclasses.replace(samples, light=samples.light % self.lights)
-            parts.append(estimate(part, by_light))
-            self.report_progress(stage, part.stop / max(len(self.store.surface), 1))
+
+        def of_part(part: slice) -> PointValues:
+            samples = self.samples(part)
+            return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
+
+        parts = list(self.compute_tiles(stage, self.parts(), of_part))
         arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
         return PointValues(*map(np.concatenate, arrays))
 
@@ -111,14 +118,18 @@ def fit_lobes(
             "lower rank, or capture more lights [SR-REC-012]"
         )
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
-    fitted = []
-    for part, samples in lumitexels.chunks():
-        points = drawn[(drawn >= part.start) & (drawn < part.stop)]
-        if not len(points):
-            continue
-        some = estimates.select_points(samples, points - part.start)
+
+    def drawn_in(part: slice) -> Int64Array:
+        return drawn[(drawn >= part.start) & (drawn < part.stop)]
+
+    def fit_drawn(part: slice) -> Float64Array:
+        points = drawn_in(part)
+        some = estimates.select_points(lumitexels.samples(part), points - part.start)
         shine = estimates.specular_samples(some, point_normals[points], point_r_d[points])
-        fitted.append(brdf_basis.fit_weights(shine, materials).weights)
+        return brdf_basis.fit_weights(shine, materials).weights
+
+    parts = [part for part in lumitexels.parts() if len(drawn_in(part))]
+    fitted = list(lumitexels.compute_tiles("mixtures of materials", parts, fit_drawn))
     shares = _normalize_mixtures(
         np.concatenate(fitted), materials, min_points=max(rank, 2 * BASIS_RANK)
     )

@@ -1,7 +1,6 @@
 """The dome's stages: images under one light each and a scan, to normals, albedo and lobes."""
 
 import math
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,7 @@ from model.vectors import unit_vectors
 from reconstruction import photometric_stereo
 from reconstruction.lumitexels import SampledSurface
 from reconstruction.lumitexels.ray_casting import RayCaster
-from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.lumitexels.store import LumitexelStore, ViewSamples
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.dome.calibrated import CalibratedDome, load_dome, split_exposures
 from reconstruction.pipeline.dome.images import DomeImages
@@ -93,7 +92,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("surface", "", "surface", partial(_surface, inputs, dome)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
         stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
-        stage("lumitexels", "surface motion", "lumitexels", partial(sample_surface, dome)),
+        stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, inputs, dome)),
         stage("sample counts", "lumitexels texture", "samples", _counts),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
         stage("normals", seen, "point_normals normals", partial(_normals, dome)),
@@ -207,16 +206,42 @@ def _motion(inputs: Inputs, dome: CalibratedDome, surface: RefinedScan) -> DomeH
     return found
 
 
-def sample_surface(
-    dome: CalibratedDome, surface: RefinedScan, motion: DomeHeadMotion | None
+def _lumitexels(
+    inputs: Inputs, dome: CalibratedDome, surface: RefinedScan, motion: DomeHeadMotion | None
 ) -> SurfaceSampleStore:
-    """Sample all images at the points of a surface; ``motion`` is None for a fixed head."""
+    captures = dome.images.captures
+    if motion is not None and not motion.still:
+        captures = dome.images.split_exposures().captures
+    count = len(surface.points_mm) * len(dome.cameras) * len(captures)
+    if 12 * count <= MEMORY_BYTES:
+        return sample_surface(dome, surface, motion)
+    return sample_surface(dome, surface, motion, inputs.scratch_folder("lumitexels"))
+
+
+def sample_surface(
+    dome: CalibratedDome,
+    surface: RefinedScan,
+    motion: DomeHeadMotion | None,
+    scratch: tuple[Path | None, object] = (None, None),
+) -> SurfaceSampleStore:
+    """Sample all images at the points of a surface.
+
+    Parameters
+    ----------
+    dome
+        Images, cameras and lights.
+    surface
+        Points and the mesh that shadows them.
+    motion
+        None: the head is fixed.
+    scratch
+        Folder for the tables, and an object that keeps it; None: in memory.
+    """
     if motion is not None and motion.still:
         motion = None
     if motion is not None:
         dome = split_exposures(dome)
-    count = len(surface.points_mm) * len(dome.cameras) * len(dome.images.captures)
-    folder = tempfile.TemporaryDirectory(prefix="skinrig-") if 12 * count > MEMORY_BYTES else None
+    folder, keeper = scratch
     store = LumitexelStore(
         SampledSurface(surface.points_mm, surface.normals),
         cameras=dome.cameras,
@@ -224,15 +249,20 @@ def sample_surface(
         caster=RayCaster(surface.coarse.vertices_mm, surface.coarse.faces),
         poses=None if motion is None else motion.poses,
         binning=2,
-        folder=None if folder is None else Path(folder.name),
+        folder=folder,
     )
     usable = dome.lights.valid if motion is None else dome.lights.valid & motion.usable
-    for view in range(len(dome.cameras)):
-        dome.report_progress("lumitexels", view / len(dome.cameras))
+
+    def sample(view: int) -> ViewSamples:
         for capture in np.flatnonzero(usable).tolist():
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return SurfaceSampleStore(store, folder, len(dome.table.names), dome.report_progress)
+        return store.view_samples(view)
+
+    views = range(len(dome.cameras))
+    for view, samples in enumerate(dome.compute_tiles("lumitexels", views, sample)):
+        store.put_view(view, samples)
+    return SurfaceSampleStore(store, keeper, len(dome.table.names), dome.compute_tiles)
 
 
 def _counts(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:

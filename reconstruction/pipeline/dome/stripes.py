@@ -11,7 +11,7 @@ import numpy as np
 from capture import raw
 from capture.calibration.geometry import CameraPose
 from capture.calibration.geometry.intrinsics import poses_from_calibration
-from capture.rig import Scanner
+from capture.rig import Projector, Scanner
 from capture.session import Session
 from reconstruction.arrays import Float64Array
 from reconstruction.pipeline.inputs import Inputs
@@ -93,11 +93,10 @@ def decode_scan(inputs: Inputs) -> DecodedScan:
     devices, depth_mm, calibrated = _devices(inputs, scanner)
     pixel_mm = float(np.median([v.distance_mm / v.focal_px for v in scanner.views]))
     voxel_mm = max(VOXEL_PIXELS * pixel_mm, MIN_VOXEL_MM)
-    maps: list[RangeMap] = []
-    shares: dict[str, float] = {}
-    for number, projector in enumerate(scanner.projectors):
-        inputs.report_progress("stripes", number / len(scanner.projectors))
-        mine = []
+
+    def decode(projector: Projector) -> tuple[list[RangeMap], dict[str, float]]:
+        mine: list[RangeMap] = []
+        shares: dict[str, float] = {}
         for camera in projector.cameras:
             found = read_stripes(session, scanner, camera, projector.name, "columns")
             if found is None:
@@ -107,7 +106,13 @@ def decode_scan(inputs: Inputs) -> DecodedScan:
             ranges = triangulate_stripes(eye, lamp, found[0], limits_mm=scanner.range_mm)
             mine.append(ranges)
             shares[f"{camera} {projector.name}"] = float(ranges.valid.mean())
-        maps += drop_contradictions(mine, devices[projector.name])
+        return drop_contradictions(mine, devices[projector.name]), shares
+
+    maps: list[RangeMap] = []
+    shares: dict[str, float] = {}
+    for ranges, decoded in inputs.compute_tiles("stripes", scanner.projectors, decode):
+        maps += ranges
+        shares |= decoded
     mesh, noise_mm = fuse_ranges(maps, voxel_mm=voxel_mm)
     record = {
         "source": "stripes",

@@ -364,9 +364,9 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap | Fac
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(map_stderr(diffuse))
     errors = model_error.image_covariance(diffuse.values, variance, diffuse.mask)
-    whole = estimate_face(
-        rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
-    )
+    part = rig.inputs.compute_part
+    given: dict[str, Any] = {"prior": prior, "variance": variance, "model_error": errors}
+    whole = estimate_face(rgb, table, **given, has_white=has_white, compute_part=part)
     found, by_face = whole.found, whole.by_face
     plain = np.exp(-whole.log_color)
     by_noise = partial(
@@ -376,12 +376,11 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap | Fac
         prior=prior,
         variance=variance * plain**2,
     )
-    noise_alone = by_noise(face=whole.face)
+    noise_alone = part("errors by noise", lambda: by_noise(face=whole.face))
     # the face's prior does not apply to moles, lips and eyelids, which can be other skin
     if whole.face is not None:
-        noise_alone = dark_spots.average_hypotheses(
-            noise_alone, by_noise(valid=whole.spots), whole.spots
-        )
+        of_spots = part("errors by noise in spots", lambda: by_noise(valid=whole.spots))
+        noise_alone = dark_spots.average_hypotheses(noise_alone, of_spots, whole.spots)
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:

@@ -412,9 +412,12 @@ def _kernels(
     _histograms: Mapping[str, NormalStatistics],
     **heights: SkinMap,
 ) -> bytes:
-    report = partial(inputs.report_progress, "kernels")
     document = fit_kernels(
-        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, report_progress=report
+        _strains,
+        _by_state(heights),
+        _histograms,
+        pixel_um=rig.pixel_um,
+        compute_tiles=inputs.compute_tiles,
     )
     return stages.serialize_document(document)
 

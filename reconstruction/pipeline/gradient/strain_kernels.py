@@ -1,7 +1,7 @@
 """Histograms of the normals of strained skin, and kernels that map neutral skin's to them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -290,7 +290,7 @@ def fit_kernels(
     statistics: Mapping[str, NormalStatistics],
     *,
     pixel_um: float,
-    report_progress: Callable[[float], None],
+    compute_tiles: Callable[..., Iterator[dict[str, Any] | None]],
 ) -> dict[str, Any]:
     """Fit a kernel to every strained state, and lines to the kernels of each angle.
 
@@ -300,8 +300,8 @@ def fit_kernels(
         As of `count_normals`.
     statistics
         What it returned.
-    report_progress
-        Called with the fraction that is done.
+    compute_tiles
+        See `reconstruction.pipeline.inputs.Inputs.compute_tiles`.
 
     Returns
     -------
@@ -312,13 +312,12 @@ def fit_kernels(
     height = heights[neutral.state.name]
     counted = [each for each in strains[1:] if each.usable and each.state.name in statistics]
     todo = [each for each in counted if abs(each.stretch_s[0] - 1.0) >= MIN_STRAIN]
-    fits = []
-    for number, each in enumerate(todo):
-        report_progress(number / len(todo))
+
+    def fit_state(each: StateStrain) -> dict[str, Any] | None:
         seen = common_skin(each, neutral, heights, there=False)
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
         if np.count_nonzero(inside) < MIN_SAMPLES:
-            continue
+            return None
         target, strained = statistics[each.state.name], heights[each.state.name]
         there = common_skin(each, neutral, heights)
         every = 1 if np.count_nonzero(inside) >= MAX_FULL_GRID_PX else COARSE_GRID_STEP
@@ -334,7 +333,9 @@ def fit_kernels(
             target_samples=target.effective_samples,
             target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
         )
-        fits.append(_entry(each, fit))
+        return _entry(each, fit)
+
+    fits = [fit for fit in compute_tiles("kernels", todo, fit_state) if fit is not None]
     angles = sorted({fit["angle_deg"] for fit in fits})
     tables = [table for angle in (None, *angles) if (table := _table(fits, angle)) is not None]
     found = {"fits": fits, "tables": tables, "direction": _direction(fits)}

@@ -111,16 +111,15 @@ def _profiles(
     if fibers is None:
         raise InputsError("the fibers are not calibrated; give their calibration")
     images = ProbeImages(inputs.session, noise=noise)
-    found = []
-    for number, measurement in enumerate(images.measurements):
-        inputs.report_progress("profiles", number / len(images.measurements))
+
+    def measure(measurement: Measurement) -> MeasuredProfile:
         merged = images.merged(measurement)
         # the camera may have moved relative to the fibers since the calibration
         spots, _ = fibers.spots.track(merged, noise.pattern)
         readings = sum_spots(merged, spots, noise=noise)
-        found.append(
-            MeasuredProfile(measurement, fibers.reflectance(readings, level=measurement.level))
-        )
+        return MeasuredProfile(measurement, fibers.reflectance(readings, level=measurement.level))
+
+    found = list(inputs.compute_tiles("profiles", images.measurements, measure))
     return {"_profiles": found, PROFILE_FILE: stages.serialize_document(_profile_document(found))}
 
 

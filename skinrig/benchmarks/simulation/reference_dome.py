@@ -316,7 +316,15 @@ def _calibrated_dome(rig: Rig, images: DomeImages) -> CalibratedDome:
     response = tuple(
         np.ones((view.height_px // 2, view.width_px // 2, 3), np.float32) for view in rig.views
     )
-    return CalibratedDome(images, cameras, lights, lights, response, True, lambda *_: None)
+    return CalibratedDome(
+        images,
+        cameras,
+        lights,
+        lights,
+        response,
+        True,
+        lambda _, tiles, compute: map(compute, tiles),
+    )
 
 
 def _plane_scan(normal: Float64Array, scan_normal: Float64Array, step_mm: float) -> RefinedScan:

@@ -325,6 +325,32 @@ def test_disk_store_gives_same_samples_chunk_by_chunk(tmp_path):
     assert covered == len(where)
 
 
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_view_of_interrupted_store_gives_same_samples(tmp_path, on_disk):
+    """The second store reads one view's images; the other's samples come from the first store."""
+    where, folder = surface(5), tmp_path if on_disk else None
+    words = {"cameras": CAMERAS, "lights": LIGHTS, "caster": CASTER, "folder": folder}
+
+    def fill(store, view):
+        for light in range(4):
+            store.add(view, light, *image(view, light))
+
+    interrupted = LumitexelStore(where, **words)
+    fill(interrupted, 0)
+    samples = interrupted.view_samples(0)
+    assert (samples.table is None) == on_disk
+    whole = LumitexelStore(where, **(words | {"folder": None}))
+    resumed = LumitexelStore(where, **words)
+    for view in range(2):
+        fill(whole, view)
+    resumed.put_view(0, samples)
+    fill(resumed, 1)
+    expected, found = whole.chunk(0, len(where)), resumed.chunk(0, len(where))
+    assert expected.valid.any()
+    for field in dataclasses.fields(expected):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
+
+
 def test_requested_samples_are_kept_until_new_image_arrives(tmp_path, monkeypatch):
     where = surface(5)
     words = {"cameras": CAMERAS, "lights": LIGHTS, "caster": CASTER}

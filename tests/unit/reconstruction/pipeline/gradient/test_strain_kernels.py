@@ -87,8 +87,14 @@ def fitted(relief):
         heights[strains[-1].state.name] = as_map(middle(strained(relief, angle, r, alpha, sigma)))
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
     told = []
+
+    def compute_tiles(name, tiles, compute):
+        for number, tile in enumerate(tiles):
+            told.append(number / len(tiles))
+            yield compute(tile)
+
     document = fit_kernels(
-        strains, heights, counted, pixel_um=PIXEL_UM, report_progress=told.append
+        strains, heights, counted, pixel_um=PIXEL_UM, compute_tiles=compute_tiles
     )
     return strains, counted, document, told
 
@@ -239,7 +245,11 @@ def test_state_near_neutral_or_unstrained_has_no_kernel(relief):
     heights = {each.state.name: as_map(middle(relief)) for each in strains}
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
     document = fit_kernels(
-        strains, heights, counted, pixel_um=PIXEL_UM, report_progress=lambda share: None
+        strains,
+        heights,
+        counted,
+        pixel_um=PIXEL_UM,
+        compute_tiles=lambda name, tiles, compute: map(compute, tiles),
     )
     assert document["fits"] == []
     assert document["tables"] == []

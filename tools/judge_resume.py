@@ -1,0 +1,266 @@
+"""Kill commands with SIGKILL at random moments, repeat them, and compare the bytes.
+
+Each command runs once undisturbed. Then it is killed, repeated (`reconstruct`: the same command,
+`simulate`: with --resume) and killed until it ends. The seconds from its first step to the kill are
+drawn uniformly up to --span of the undisturbed run's. Its output is compared with the undisturbed
+one. Stages and tiles that begin again although they began before the kill are counted by the
+events of --json.
+
+    skinrig demo --out DEMO
+    python tools/judge_resume.py DEMO --kills 50 --out record.json
+"""
+
+import argparse
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
+    "flash": (
+        "session-flash-II",
+        "calibration-flash",
+        "melanin,hemoglobin,shading,diffuse,specular,tsumura_melanin",
+    ),
+    "dome": (
+        "session-dome-III",
+        "calibration-dome",
+        "half_vector_normals,normals,r_d,normals_refined,samples",
+    ),
+    "gradient": (
+        "session-gradient-forehead",
+        "calibration-gradient",
+        "normals,height,crossed,strain,histograms,kernels",
+    ),
+    "probe": ("session-probe-III", "calibration-probe", "profiles,subsurface,translucency"),
+}
+"""Session, calibration (empty: none) and maps of each rig in the folder of a demo."""
+SIMULATIONS: Mapping[str, Sequence[str]] = {
+    "simulate flash": (
+        *("flash", "--subject", "IV", "--width", "64"),
+        *("--omit", "lateral,interreflections,relief_shadows"),
+    ),
+    "simulate probe": ("probe", "--subject", "homogeneous:0.08,1.2"),
+}
+"""Arguments of `skinrig simulate`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kill:
+    """Outcome of one kill.
+
+    Attributes
+    ----------
+    command
+        Name of the command.
+    after_s, whole_s
+        Seconds from the first step to the kill, and those of the undisturbed run to its last step.
+    same
+        Whether the final output equals the undisturbed one.
+    interrupted
+        Stages and tiles at work when the process was killed that began again.
+    left_out
+        Stages and tiles that were complete before the kill and began again, as storing them would
+        have cost too much.
+    left_out_s
+        Seconds of these before the kill.
+    """
+
+    command: str
+    after_s: float
+    whole_s: float
+    same: bool
+    interrupted: int
+    left_out: tuple[str, ...]
+    left_out_s: float
+
+
+def hash_folder(folder: Path) -> dict[str, str]:
+    """Hash the files of a folder by their relative paths."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def hash_outputs(out: Path) -> dict[str, str]:
+    """Hash an output folder, or the plan and frames of a session and its ground truth's images.
+
+    Documents of a session and its truth contain the time of the capture.
+    """
+    truth = out.with_name(f"truth-{out.name}")
+    if not truth.is_dir():
+        return hash_folder(out)
+    found = hash_folder(out / "frames")
+    images = {name: digest for name, digest in hash_folder(truth).items() if ".exr" in name}
+    return found | {f"truth {name}": digest for name, digest in images.items()}
+
+
+def remove_outputs(out: Path) -> None:
+    """Remove an output folder, and the ground truth of a session."""
+    for folder in (out, out.with_name(f"truth-{out.name}")):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def start(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
+    """Start skinrig with --json; its events go to a file."""
+    with open(log, "wb") as stream:
+        return subprocess.Popen(
+            [sys.executable, "-m", "skinrig", *arguments, "--json"],
+            stdout=subprocess.DEVNULL,
+            stderr=stream,
+            start_new_session=True,
+        )
+
+
+def read_events(log: Path) -> list[tuple[str, float]]:
+    """Return text and seconds of the beginnings of steps in a file."""
+    events = []
+    for line in log.read_text().splitlines():
+        if line.startswith('{"event"') and line.endswith("}"):
+            event = json.loads(line)
+            if event["event"] == "progress":
+                events.append((str(event["text"]), float(event["seconds"])))
+    return events
+
+
+def count_repeated(
+    before: Sequence[tuple[str, float]], after: Sequence[tuple[str, float]]
+) -> tuple[int, tuple[str, ...], float]:
+    """Return how many interrupted parts, which complete parts and how many of their seconds repeat.
+
+    Parameters
+    ----------
+    before, after
+        Beginnings of stages and tiles before and after the kill: text and seconds.
+
+    Examples
+    --------
+    >>> before = [("frames", 0.0), ("fit", 0.5), ("fit: 0/2", 0.5), ("fit: 1/2", 9.0)]
+    >>> count_repeated(before, [("frames", 0.0), ("fit", 0.5), ("fit: 1/2", 0.5)])
+    (1, ('frames',), 0.5)
+    """
+    again = {text for text, _ in after}
+    interrupted, complete, seconds = 0, [], 0.0
+    for number, (text, at_s) in enumerate(before):
+        if text not in again:
+            continue
+        parts = any(other.startswith(f"{text}: ") for other, _ in before[number + 1 :])
+        if number == len(before) - 1:
+            interrupted += 1
+        elif not parts:
+            complete.append(text)
+            seconds += before[number + 1][1] - at_s
+    return interrupted, tuple(complete), seconds
+
+
+def kill_until_done(
+    name: str,
+    run: Sequence[str],
+    out: Path,
+    *,
+    whole: tuple[float, Mapping[str, str]],
+    rng: np.random.Generator,
+    again: Sequence[str] = (),
+    span: float = 0.5,
+) -> list[Kill]:
+    """Kill a command at random moments and repeat it until it ends; compare its output."""
+    seconds, expected = whole
+    log = out.with_suffix(".log")
+    kills: list[tuple[float, list[tuple[str, float]]]] = []
+    code = None
+    while code is None:
+        after_s = float(rng.uniform(0.0, span * seconds))
+        process = start([*run, *(again if out.exists() else ())], log)
+        while process.poll() is None and not read_events(log):
+            time.sleep(0.02)
+        try:
+            code = process.wait(timeout=after_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        kills.append((after_s, read_events(log)))
+    same = code == 0 and hash_outputs(out) == expected
+    same &= not list(out.parent.glob(f".{out.name}.*"))
+    remove_outputs(out)
+    return [
+        Kill(name, after_s, seconds, same, *count_repeated(before, after))
+        for (after_s, before), (_, after) in pairwise(kills)
+    ]
+
+
+def judge(
+    demo: Path, work: Path, names: Sequence[str], kills: int, seed: int, span: float = 0.5
+) -> list[Kill]:
+    """Kill each command in turn until there are enough kills; print each outcome."""
+    rng = np.random.default_rng(seed)
+    runs: dict[str, tuple[list[str], tuple[str, ...]]] = {}
+    for name in names:
+        if name in SIMULATIONS:
+            runs[name] = (["simulate", *SIMULATIONS[name], "--seed", "3"], ("--resume",))
+        else:
+            session, calibration, maps = RECONSTRUCTIONS[name]
+            given = [str(demo / session)]
+            if calibration:
+                given += ["--calibration", str(demo / calibration)]
+            runs[name] = (["reconstruct", *given, "--maps", maps], ())
+    found: list[Kill] = []
+    undisturbed: dict[str, tuple[float, Mapping[str, str]]] = {}
+    out = work / "out"
+    for name, (run, _) in runs.items():
+        log = work / "whole.log"
+        if start([*run, "--out", str(out)], log).wait() != 0:
+            raise SystemExit(log.read_text())
+        events = read_events(log)
+        undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
+        remove_outputs(out)
+    for name in itertools.cycle(runs):
+        if len(found) >= kills:
+            break
+        run, again = runs[name]
+        given_out = [*run, "--out", str(out)]
+        chain = kill_until_done(
+            name, given_out, out, whole=undisturbed[name], rng=rng, again=again, span=span
+        )
+        found += chain
+        for kill in chain:
+            print(json.dumps(asdict(kill)), flush=True)
+    return found
+
+
+def main() -> int:
+    """Judge by the arguments; 1 when an output differs or more than one part repeats per kill."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("demo", type=Path, help="folder of `skinrig demo`")
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--span", type=float, default=0.5, help="latest kill, over the run's time")
+    parser.add_argument("--commands", default=",".join([*RECONSTRUCTIONS, *SIMULATIONS]))
+    parser.add_argument("--work", type=Path, required=True, help="new folder for outputs")
+    given = parser.parse_args()
+    given.work.mkdir(parents=True)
+    names = given.commands.split(",")
+    found = judge(given.demo, given.work, names, given.kills, given.seed, given.span)
+    print("command, kills, same bytes, interrupted parts, complete parts again, their seconds")
+    for name in names:
+        own = [kill for kill in found if kill.command == name]
+        same = sum(kill.same for kill in own)
+        parts = sum(kill.interrupted for kill in own), sum(len(kill.left_out) for kill in own)
+        print(name, len(own), same, *parts, round(sum(kill.left_out_s for kill in own), 1))
+    return int(any(not kill.same or kill.interrupted > 1 for kill in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
