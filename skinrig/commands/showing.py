@@ -20,7 +20,7 @@ from skinrig.errors import EXIT_LIMIT_MISSED, UnusableError, UsageError
 
 MAX_PORT = 65_535
 FACE_PX, PEOPLE_PX = 2048, 1024
-"""Sides of the textures of one face and of several, texels: both pages stay below 5 MB."""
+"""Width of the textures of one face and of several, texels; pages of up to three have 5 MB."""
 
 
 @command
@@ -165,7 +165,7 @@ class HeadOptions:
     Attributes
     ----------
     preset
-        Skin type of the simulated head: I to VI, palest or darkest.
+        Skin type of the simulated head: I to VI, palest or darkest; default III.
     seed
         Random seed of the simulated head.
     size_px
@@ -174,7 +174,7 @@ class HeadOptions:
         Skin types of several simulated people on one head, separated by commas: II,IV,VI.
     """
 
-    preset: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III"
+    preset: Annotated[str | None, typer.Option(autocompletion=completion.complete_subjects)] = None
     seed: int = 0
     size_px: int | None = None
     people: str | None = None
@@ -220,10 +220,13 @@ def view(
         raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}; name another")
     if displacement is not None and port is None:
         raise UsageError("displacement: needs a served page; add --port 0")
-    given = select_attributes(face, "mesh", "landmarks", "calibration")
     people = tuple(parse_names(head.people) or ())
-    side = head.size_px or (PEOPLE_PX if people else FACE_PX)
-    given |= select_attributes(head, "preset", "seed") | {"size": side, "people": people}
+    if people and head.preset is not None:
+        raise UnusableError(f"--preset: got {head.preset} with --people; name each type there")
+    side = (PEOPLE_PX if people else FACE_PX) if head.size_px is None else head.size_px
+    given = select_attributes(face, "mesh", "landmarks", "calibration")
+    given |= {"seed": head.seed, "size": side, "people": people}
+    given |= {} if head.preset is None else {"preset": head.preset}
     console.progress("making textures and tables")
     scene = faces.build_scene(appearance or [], **given, progress=console.progress)
     console.progress("packing")

@@ -137,6 +137,8 @@ def assemble_scene(
 
 DEFAULT_PRESET = "III"
 """Skin type of faces without measured skin."""
+MAX_PEOPLE = 6
+"""Largest number of people of one page, for the size of the page."""
 MESH_FILE: Final = "mesh.obj"
 ALBEDO_MAP: Final = "r_d"
 CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic")
@@ -211,6 +213,8 @@ def build_scene(
         raise SceneError(
             "--people: got simulated people and an appearance; show one of both, or a page each"
         )
+    if len(people) > MAX_PEOPLE:
+        raise SceneError(f"--people: got {len(people)} types, expected at most {MAX_PEOPLE}")
     preset = people[0] if people else preset
     folders, appearances = _read(paths)
     whole, mesh_origin = _mesh(appearances, mesh)

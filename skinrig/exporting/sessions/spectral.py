@@ -90,7 +90,8 @@ def write_spectra(
         for name in ("melanin", "hemoglobin", "diffuse", "specular"):
             if name in maps and maps[name].valid is not None:
                 mask = np.asarray(maps[name].valid, np.float32)
-                write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
+                header = {"unit": "1", PROVENANCE_KEY: format_provenance(appearance)}
+                write_channels(folder / f"{name}_valid.exr", {"Y": mask}, header)
     document: dict[str, Any] = {
         "schema": SPECTRAL_SCHEMA,
         "orientation": IMAGE_ORIENTATION,
