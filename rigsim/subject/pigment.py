@@ -108,7 +108,8 @@ def draw_melanin_map(
 def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
     """Return the lack of suntan under a cap or behind glasses; the base is tanned skin.
 
-    Borders are about 15 mm wide: neither stays in one place for the days that a suntan takes.
+    Borders are 13 to 20 mm wide (10 to 90 %): neither stays in one place for the days that a suntan
+    takes.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))

@@ -321,13 +321,20 @@ def _assume_light_distance(probe: Source) -> list[str]:
     packaged = load_rig("probe").probe
     if document is None or packaged is None:
         return []
-    radius_mm, usual_mm = json.loads(document)["radius_mm"], packaged.radius_mm
+    usual_mm = packaged.radius_mm
+    try:
+        radius_mm = [float(radius) for radius in json.loads(document)["radius_mm"]]
+        low, high = min(radius_mm), max(radius_mm)
+    except (ValueError, KeyError, TypeError) as error:
+        raise FusionInputError(
+            f"{PROFILE_FILE}: not readable: {error!r}; reconstruct the probe's session again"
+        ) from error
     if len(radius_mm) == len(usual_mm) and np.allclose(radius_mm, usual_mm, atol=0.05):
         return []
     return [
         f"probe: its light has sigma_tr at {SIGMA_TR_DISTANCE_MM:g} mm, set for fibers at "
-        f"{usual_mm[0]:g} to {usual_mm[-1]:g} mm; its fibers are at {min(radius_mm):g} to "
-        f"{max(radius_mm):g} mm"
+        f"{usual_mm[0]:g} to {usual_mm[-1]:g} mm; its fibers are at {low:g} to "
+        f"{high:g} mm"
     ]
 
 

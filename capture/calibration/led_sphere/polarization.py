@@ -203,8 +203,13 @@ class _ArrowSystem:
     one: Float64Array  # right sides, (L, 2)
     other: Float64Array  # (3,)
 
-    def solve(self, damping: float) -> tuple[Float64Array, Float64Array]:
-        """Return the parameters, with a damped diagonal."""
+    def solve(
+        self, damping: float, otherwise: _ArrowSystem | None = None
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return the parameters, with a damped diagonal.
+
+        Where the common ones have no minimum, they are those of ``otherwise``.
+        """
         damped = self.block + damping * self.block * np.eye(2)
         inverse = np.linalg.inv(damped)
         through = inverse @ self.border
@@ -212,7 +217,10 @@ class _ArrowSystem:
         schur = schur - np.einsum("kia,kib->ab", self.border, through)
         local = np.einsum("kij,kj->ki", inverse, self.one)
         right = self.other - np.einsum("kia,ki->a", self.border, local)
-        shared = np.linalg.solve(schur, right)
+        if otherwise is not None and np.linalg.eigvalsh(schur)[0] <= 0.0:
+            shared = otherwise.solve(damping)[1]
+        else:
+            shared = np.linalg.solve(schur, right)
         return local - through @ shared, shared
 
     def covariance(self) -> tuple[Float64Array, Float64Array, Float64Array]:
@@ -330,7 +338,7 @@ class _PolarizerProblem:
         for _ in range(MAX_POLARIZER_STEPS):
             plain, curved = self._normal()
             while True:
-                local, shared = curved.solve(damping)
+                local, shared = curved.solve(damping, plain)
                 trial = self._stepped(local, self.shared + np.clip(shared, -0.5, 0.5))
                 cost = self._objective(*trial)
                 if cost <= now or damping > 1e8:

@@ -35,11 +35,11 @@ def draw_face(table, rng, *, pixels=60):
 
 @pytest.mark.long
 def test_intervals_of_drawn_faces_cover_nominally(table, rng):
-    """Over 200 faces the count within one standard error is binomial about 68 %.
+    """Over 300 faces the count within one standard error is binomial about 68 %.
 
     The posterior is not normal, so the band is that of 60 to 76 % widened by the sampling error.
     """
-    faces, inside, narrow = 200, np.zeros(2), np.zeros(2)
+    faces, inside, narrow = 300, np.zeros(2), np.zeros(2)
     for _ in range(faces):
         rgb, log_melanin, log_blood = draw_face(table, rng)
         found = estimate_common_optics(rgb, table, prior=PRIOR, common_light=COMMON_LIGHT)

@@ -280,11 +280,13 @@ def test_stretching_smooths_and_compressing_roughens_along_the_jaws(site: str) -
 
 @pytest.mark.long
 @pytest.mark.parametrize("site", SITE_NAMES)
-@pytest.mark.parametrize(("angle_deg", "seed"), [(0.0, 2), (45.0, 3), (90.0, 4)])
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0])
 @pytest.mark.parametrize("compensation", ["volume", "none"])
 def test_slope_variances_are_monotone_for_all_sites_angles(
-    site: str, angle_deg: float, seed: int, compensation: Compensation
+    site: str, angle_deg: float, compensation: Compensation
 ) -> None:
+    # each site has another skin at each angle
+    seed = 2 + (SITE_NAMES.index(site) + round(angle_deg / 45.0)) % 3
     skin = make_micro_skin(site, seed=seed, size_mm=1.2)
     variance = [
         slopes_along(

@@ -334,3 +334,10 @@ def test_other_probe_states_its_light_distance(tmp_path, scale, stated):
     texts = double._assume_light_distance(probe)
     assert len(texts) == stated
     assert all(f"its fibers are at {min(radius_mm):g} to" in text for text in texts)
+
+
+@pytest.mark.parametrize("document", [b"", b"null", b"{}", b'{"radius_mm": []}', b"[1]"])
+def test_unreadable_profiles_of_probe_are_refused(tmp_path, document):
+    appearance = SkinAppearance({}, "simulated", files={PROFILE_FILE: document})
+    with pytest.raises(FusionInputError, match=r"profiles\.json: not readable"):
+        double._assume_light_distance(Source("probe", tmp_path, appearance))

@@ -55,10 +55,11 @@ def spots(
     return readings, counted / amount, variance / amount**2, good, truth
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_far_axes_converge_from_two_readings(seed, caplog):
+@pytest.mark.parametrize(("turn_deg", "seed"), [(1.0, 2), (1.0, 3), (3.0, 2)])
+def test_far_axes_converge_from_two_readings(turn_deg, seed, caplog):
     """Gauss and Newton's steps alone halve the distance of a crossed light, and reach the limit."""
-    *data, _ = spots(np.random.default_rng(seed), zero_deg=0.6, turn_deg=1.0, series=TWO_STATES)
+    rng = np.random.default_rng(seed)
+    *data, _ = spots(rng, zero_deg=0.6, turn_deg=turn_deg, series=TWO_STATES)
     fit_polarizers(*data, GLASS)
     assert caplog.records == []
 
