@@ -25,7 +25,7 @@ from skinrig.unit_format import format_quantity
 from skinrig.workspace import scan
 
 GOOD_STATES: Final = ("sound", "valid", "up to date")
-DAMAGED: Final = "damaged"
+DAMAGED_STATE: Final = "damaged"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def read_status(
     for path in tuple(found.sessions):
         begin(path)
         results.append(_read_session(path, today))
-        if results[-1].state == DAMAGED:
+        if results[-1].state == DAMAGED_STATE:
             found.sessions.remove(path)
     appearances: dict[str, SkinAppearance] = {}
     for name, path in tuple(found.appearances.items()):
@@ -122,7 +122,7 @@ def read_status(
             appearances[name] = store.read(path)
         except store.StoreError as error:
             del found.appearances[name]
-            results.append(ResultState("maps", name, DAMAGED, str(error)))
+            results.append(_describe_damage("maps", name, error))
     facts = read_session_facts(found.sessions)
     for path in found.calibrations:
         results += _read_calibrations(path, appearances, facts, today)
@@ -135,14 +135,19 @@ def read_status(
     return FolderStatus(folder.absolute().name, tuple(results), tuple(checks), steps)
 
 
+def _describe_damage(kind: str, name: str, error: object) -> ResultState:
+    """Return the state of a damaged result, with its error on one line."""
+    return ResultState(kind, name, DAMAGED_STATE, " ".join(str(error).split()))
+
+
 def _read_session(path: Path, today: date) -> ResultState:
     try:
         report = verify(path, today=today)
         if not report.ok:
-            return ResultState("session", path.name, DAMAGED, report.problems[0])
+            return _describe_damage("session", path.name, report.problems[0])
         session = Session.open(path)
     except (SessionError, OSError, ValueError) as error:
-        return ResultState("session", path.name, DAMAGED, str(error))
+        return _describe_damage("session", path.name, error)
     size = f"{format_count(report.frames, 'frame')}, {report.bytes / 1e6:.1f} MB"
     expires = session.manifest.subject.consent_expires
     if expires is not None and today > expires:
@@ -167,7 +172,7 @@ def _read_calibrations(
         try:
             one = calibration_store.load(folder, file.stem)
         except (CalibrationError, ValueError) as error:
-            yield ResultState("calibration", name, DAMAGED, str(error))
+            yield _describe_damage("calibration", name, error)
             continue
         _, captured = list_uses(file, appearances, sessions)
         outside = [day.isoformat() for day in captured if count_days_left(one, day) < 0]
@@ -219,7 +224,7 @@ def _drop_damaged_rest(found: ReportInputs, begin: Callable[[Path], None]) -> It
                 read(path)
             except (store.StoreError, ReportError) as error:
                 places.remove(path)
-                yield ResultState(kind, path.name, DAMAGED, str(error))
+                yield _describe_damage(kind, path.name, error)
     found.truths = {name: path for name, path in found.truths.items() if path in truths}
 
 

@@ -124,7 +124,15 @@ def test_truncated_file_leaves_the_other_states(results, file, kind, capsys):
     (fault,) = (one for one in found if one["state"] not in ("sound", "up to date"))
     assert (fault["kind"], fault["state"], fault["command"]) == (kind, "damaged", "")
     assert path.name in fault["detail"]
+    assert "\n" not in fault["detail"]
     assert len({"session", "maps"} & {one["kind"] for one in found}) == 2
+
+
+def test_report_names_truncated_session(results, tmp_path, capsys):
+    path = results / "session/session.json"
+    path.write_bytes(path.read_bytes()[:-40])
+    assert main(["report", str(results), "-o", str(tmp_path / "report.html")]) == 3
+    assert f"{path}: is not JSON" in capsys.readouterr().err
 
 
 def test_session_without_end_is_incomplete(results):
