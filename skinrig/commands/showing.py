@@ -97,9 +97,9 @@ def status(
     out: Annotated[Path | None, typer.Option("-o", "--out", callback=check_output_page)] = None,
     json: Json = False,
 ) -> None:
-    """List the state of every result in a folder, and the command that repeats a failed check.
+    """List the state of every result in a folder, and how to repeat maps that need it.
 
-    The exit code is 1 if a result needs work or a check missed its limit.
+    The exit code is 1 if a result has a fault or a check missed its limit.
 
     Example: skinrig status demo
 
@@ -118,16 +118,16 @@ def status(
     from skinrig.reporting.status import build_status_page, read_status
 
     console = Console(json)
-    found = read_status(folder, today=date.today())
+    found = read_status(folder, today=date.today(), progress=console.progress)
     console.print_line(found.headline())
     rows = [(one.name, one.state, one.detail) for one in found.results]
     console.print_table(("result", "state", "detail"), rows)
     for fault in found.faults:
         if fault.command:
-            console.print_line(f"{fault.name}: {fault.state}; run in {folder}: {fault.command}")
+            console.print_line(f"{fault.name}: {fault.state}; repeat: {fault.command}")
     for check in found.missed:
-        again = check.command or "unknown"
-        console.print_line(f"missed: {check.name}; repeat in {folder}: {again}")
+        again = f"; repeat: {check.command}" if check.command else ""
+        console.print_line(f"missed: {check.name}{again}")
     if out is not None:
         write_atomically(out, build_status_page(found))
         console.print_line(f"{out}: open it in a browser")

@@ -119,7 +119,9 @@ def _classify_entry(entry: Path, found: ReportInputs) -> None:
         if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
             found.documents.append(entry)
     elif (entry / store.DOCUMENT_FILE).is_file():
-        kind = store.read_document(entry).parameters.get("kind")
+        kind: object = None
+        with contextlib.suppress(store.StoreError):  # raised again when its maps are read
+            kind = store.read_document(entry).parameters.get("kind")
         (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
     elif (entry / "session.json").is_file():
         found.sessions.append(entry)

@@ -48,7 +48,7 @@ class Check:
     worst_got: float = float("nan")
     """Lower bound of the error in that group, in ``unit``; NaN where it is not comparable."""
     command: str = ""
-    """Command that repeats it, in the folder of the results; empty: unknown."""
+    """Command that repeats it, with the paths as given; empty: unknown."""
 
     @property
     def passed(self) -> bool:

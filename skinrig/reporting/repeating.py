@@ -1,80 +1,116 @@
-"""Find the commands that repeat the computation of maps, calibrations and benchmarks.
+"""Find the command that repeats a reconstruction, with the paths of its folders as given."""
 
-Commands name folders without their parents: they run in the folder that holds the results.
-"""
-
-import json
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from capture.calibration.record import Calibration
 from capture.session import Session, SessionError
 from model.skin import SkinAppearance
 from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.recipes import recipe_for_session
-from skinrig.appearances.contents import hash_file, is_fused
+from skinrig.appearances.contents import hash_file
 from skinrig.next_steps import shell_quote
 from skinrig.reporting.folders import ReportInputs
+from skinrig.workspace import read_document
 
 CALIBRATION_PREFIX = "calibration "
 """Prefix of an appearance's inputs that are files of a calibration."""
 
 
 def repeat_maps(name: str, appearance: SkinAppearance, found: ReportInputs) -> str:
-    """Return the command that makes maps again; empty where their session is not found.
+    """Return the command that makes maps again; empty if their folders or options are unknown.
+
+    Only `skinrig reconstruct` is repeated. Options whose files an appearance does not name, a scan,
+    a basis or landmarks, have no command.
 
     Parameters
     ----------
     name
-        Folder of the maps.
+        Name of the maps in `found`.
     appearance
         Its contents.
     found
         Sessions and calibrations near them.
     """
-    if is_fused(appearance):
-        parts = appearance.parameters.get("appearances", ())
-        names = [shell_quote(Path(str(part)).name) for part in _listed(parts)]
-        return f"skinrig fuse {' '.join(names)} --out {shell_quote(name)}" if names else ""
-    place = next(
-        (one for one in found.sessions if one.name == appearance.parameters.get("session")), None
-    )
-    if place is None:
+    used = list_used_calibrations(appearance)
+    session = find_session(appearance, found)
+    stores = list(_list_stores(used, session, found)) if session is not None else []
+    others = appearance.inputs.keys() - {CALIBRATION_PREFIX + kind for kind in used} - {"session"}
+    derived = others or "edit" in appearance.parameters
+    if session is None or derived or (used and len(stores) != 1):
         return ""
     wants: list[str] = []
     with suppress(SessionError, InputsError, OSError, ValueError):
-        session = Session.open(place)
         recipe = recipe_for_session(session)
         made = {*appearance.maps, *appearance.files}
         wants = [one for one in recipe.maps if made & set(recipe.expand(session, [one]))]
     if not wants:
         return ""
-    words = ["skinrig reconstruct", shell_quote(place.name), "--maps", ",".join(wants)]
-    used = {d for key, d in appearance.inputs.items() if key.startswith(CALIBRATION_PREFIX)}
-    stores = [one for one in found.calibrations if used & hash_files(one)]
-    words += ["--calibration", shell_quote(stores[0].name)] if stores else []
+    words = ["skinrig reconstruct", shell_quote(session.path), "--maps", ",".join(wants)]
+    words += ["--calibration", shell_quote(stores[0])] if used else []
+    words += _list_options(appearance)
+    return " ".join([*words, "--out", shell_quote(found.appearances[name])])
+
+
+def _list_options(appearance: SkinAppearance) -> Iterator[str]:
+    """Yield the words of the options that an appearance records."""
     state = str(appearance.parameters.get("state", "neutral"))
-    words += ["--state", shell_quote(state)] if state != "neutral" else []
-    return " ".join([*words, "--out", shell_quote(name)])
+    if state != "neutral":
+        yield from ("--state", shell_quote(state))
+    held = appearance.parameters.get("held_out")
+    names = {k: v for k, v in held.items() if v} if isinstance(held, dict) else {}
+    if names:
+        parts = [f"{field}={','.join(map(str, values))}" for field, values in names.items()]
+        yield from ("--hold-out", shell_quote(",".join(parts)))
+    rank = sum(one.startswith("basis_weight_") for one in appearance.maps)
+    if rank:
+        yield from ("--rank", str(rank))
 
 
-def hash_files(calibration: Path) -> set[str]:
-    """Return the digests of a calibration's documents."""
-    return {hash_file(file) for file in calibration.glob("*.json")}
+def list_used_calibrations(appearance: SkinAppearance) -> dict[str, str]:
+    """Return the digest of each calibration that maps were made with, by kind."""
+    return {
+        key.removeprefix(CALIBRATION_PREFIX): digest
+        for key, digest in appearance.inputs.items()
+        if key.startswith(CALIBRATION_PREFIX)
+    }
 
 
-def repeat_calibration(folder: str, calibration: Calibration, sessions: Iterable[Path]) -> str:
-    """Return the command that makes a calibration again; empty where a session is missing."""
-    by_id = {}
-    for session in sessions:
-        with suppress(OSError, ValueError, KeyError):
-            by_id[json.loads((session / "session.json").read_bytes())["id"]] = session.name
-    if not calibration.inputs or not set(calibration.inputs) <= by_id.keys():
-        return ""
-    given = " ".join(shell_quote(by_id[one]) for one in calibration.inputs)
-    return f"skinrig calibrate {calibration.kind} {given} --out {shell_quote(folder)}"
+def find_session(appearance: SkinAppearance, found: ReportInputs) -> Session | None:
+    """Return the session that maps were reconstructed from; None if it is not found."""
+    for place in found.sessions:
+        if place.name == appearance.parameters.get("session"):
+            with suppress(SessionError, OSError, ValueError):
+                session = Session.open(place)
+                if session.content_hash == appearance.inputs.get("session"):
+                    return session
+    return None
 
 
-def _listed(parts: object) -> list[str]:
-    return [str(part) for part in parts] if isinstance(parts, (list, tuple)) else []
+def hash_calibrations(kind: str, found: ReportInputs, rig: str | None) -> dict[Path, str]:
+    """Return the digest of the calibration of a kind, by the folder that has it.
+
+    Parameters
+    ----------
+    kind
+        Kind of calibration.
+    found
+        Its calibrations are searched.
+    rig
+        Name of the rig; None: any.
+    """
+    files = {folder: folder / f"{kind}.json" for folder in found.calibrations}
+    return {
+        folder: hash_file(file)
+        for folder, file in files.items()
+        if (document := read_document(file)) is not None
+        and (rig is None or document.get("rig") == rig)
+    }
+
+
+def _list_stores(used: Mapping[str, str], session: Session, found: ReportInputs) -> Iterator[Path]:
+    """Yield the folder with the used files; without it, all with their kinds for this rig."""
+    kinds = {kind: hash_calibrations(kind, found, session.rig.name) for kind in used}
+    complete = [f for f in found.calibrations if all(f in of_kind for of_kind in kinds.values())]
+    same = [f for f in complete if all(kinds[kind][f] == used[kind] for kind in used)]
+    yield from same[:1] or complete

@@ -164,7 +164,7 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
     for blocks in (
         _maps(found, appearances, checks),
         _documents(found, checks),
-        calibration.section(found.calibrations, appearances, sessions, checks, found.sessions),
+        calibration.section(found.calibrations, appearances, sessions, checks),
     ):
         deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
@@ -186,7 +186,7 @@ def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.B
         *chromophore.draw_identifiability(appearances.values()),
         *subsurface.compare_people(appearances, found.truths),
         *_documents(found, checks),
-        *calibration.section(found.calibrations, appearances, sessions, checks, found.sessions),
+        *calibration.section(found.calibrations, appearances, sessions, checks),
         *session.list_omissions(found.sessions),
         *provenance.consent_section([found]),
         *session.section(sessions),

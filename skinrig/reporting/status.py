@@ -1,29 +1,31 @@
-"""Describe the state of each result in a folder, with the command that repairs or repeats it."""
+"""Describe the state of each result in a folder, with the command that repeats it."""
 
-import os
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CalibrationError
-from capture.session import SessionError, verify
+from capture.session import Session, SessionError, verify
 from model import store
 from model.skin import SkinAppearance
 from skinrig.console import format_count
-from skinrig.next_steps import Step, shell_quote, suggest
+from skinrig.next_steps import Step, suggest
 from skinrig.reporting import page, repeating
-from skinrig.reporting.folders import ReportInputs, discover
+from skinrig.reporting.folders import ReportError, ReportInputs, discover, read_json
 from skinrig.reporting.report import evaluate_checks
+from skinrig.reporting.sections.calibration import count_days_left, list_uses
+from skinrig.reporting.sections.images import folder_document
+from skinrig.reporting.sections.session import SessionFacts, read_session_facts
 from skinrig.reporting.verdict import format_headline
 from skinrig.unit_format import format_quantity
 from skinrig.workspace import scan
 
-SOON_DAYS: Final = 14
-"""Days before the end of a calibration's validity from which its expiry is near."""
 GOOD_STATES: Final = ("sound", "valid", "up to date")
+DAMAGED_STATE: Final = "damaged"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +33,13 @@ class ResultState:
     """State of one result."""
 
     kind: str
-    """session, calibration or maps."""
+    """session, calibration, maps, ground truth, images or document."""
     name: str
     state: str
     """One of `GOOD_STATES`, or a fault in words."""
     detail: str
     command: str = ""
-    """Command that repairs or repeats it, in the folder of the results; empty: none."""
+    """Command that repeats it, with the paths as given; empty: none."""
 
     @property
     def is_good(self) -> bool:
@@ -66,11 +68,9 @@ class FolderStatus:
 
     def headline(self) -> str:
         """Return the verdict as one sentence."""
-        count, faults = len(self.results), len(self.faults)
-        state = f"{faults} of {count} results need work"
-        if not faults:
-            state = f"All {count} results are sound"
-        return f"{state}. {format_headline(self.checks)}"
+        faults = format_count(len(self.faults), "fault")
+        results = format_count(len(self.results), "result")
+        return f"{faults} in {results}. {format_headline(self.checks)}"
 
     def document(self) -> dict[str, Any]:
         """Return the status as JSON values."""
@@ -82,15 +82,19 @@ class FolderStatus:
         }
 
 
-def read_status(folder: Path, *, today: date) -> FolderStatus:
-    """Verify every session, calibration and set of maps in a folder, and check their limits.
+def read_status(
+    folder: Path, *, today: date, progress: Callable[[str], None] = lambda text: None
+) -> FolderStatus:
+    """Verify all sessions, calibrations and maps in a folder, and check the limits of sound ones.
 
     Parameters
     ----------
     folder
         Folder of results, such as a demo's.
     today
-        Day on which the validity of calibrations is judged.
+        Day on which consent and the age of calibrations are judged.
+    progress
+        Called before each result is read.
 
     Raises
     ------
@@ -98,96 +102,130 @@ def read_status(folder: Path, *, today: date) -> FolderStatus:
         If the folder does not exist or has no results.
     """
     found = discover([folder])
-    checks: list[page.Check] = []
-    results = [
-        *(_read_session(path) for path in found.sessions),
-        *(
-            one
-            for path in found.calibrations
-            for one in _read_calibration(path, found, today=today)
-        ),
-        *(_read_maps(name, path, found) for name, path in found.appearances.items()),
-    ]
-    evaluate_checks(found, checks)
-    steps = [
-        replace(one, command=_run_inside(one.command, folder))
-        for one in suggest(scan(folder), folder)
-    ]
-    return FolderStatus(folder.absolute().name, tuple(results), tuple(checks), tuple(steps))
+    number = itertools.count(1)
+    others = [*found.truths.values(), *found.pictures, *found.documents]
+    total = len(found.sessions) + len(found.appearances) + len(others)
 
+    def begin(path: Path) -> None:
+        progress(f"read result {next(number)}/{total}: {path}")
 
-def _run_inside(command: str, folder: Path) -> str:
-    """Return a command with its paths relative to the folder of the results.
-
-    Examples
-    --------
-    >>> _run_inside("skinrig report 'my demo'", Path("my demo"))
-    'skinrig report .'
-    >>> _run_inside("skinrig view 'my demo/maps'", Path("my demo"))
-    "skinrig view 'maps'"
-    """
-    inside = command.replace(f"{folder}{os.sep}", "")
-    return inside.replace(f" {shell_quote(folder)}", " .")
-
-
-def _read_session(path: Path) -> ResultState:
-    again = f"skinrig verify {shell_quote(path.name)}"
-    try:
-        report = verify(path)
-    except (SessionError, OSError, ValueError) as error:
-        return ResultState("session", path.name, "damaged", str(error), again)
-    size = f"{format_count(report.frames, 'frame')}, {report.bytes / 1e6:.1f} MB"
-    if report.ok:
-        return ResultState("session", path.name, "sound", size)
-    state = "damaged" if report.complete else "incomplete"
-    return ResultState("session", path.name, state, "; ".join([size, *report.problems[:1]]), again)
-
-
-def _read_calibration(path: Path, found: ReportInputs, *, today: date) -> Iterator[ResultState]:
-    for file in sorted(path.glob("*.json")):
-        name = f"{path.name}, {file.stem}"
+    results: list[ResultState] = []
+    for path in tuple(found.sessions):
+        begin(path)
+        results.append(_read_session(path, today))
+        if results[-1].state == DAMAGED_STATE:
+            found.sessions.remove(path)
+    appearances: dict[str, SkinAppearance] = {}
+    for name, path in tuple(found.appearances.items()):
+        begin(path)
         try:
-            one = calibration_store.load(path, file.stem)
-        except (CalibrationError, ValueError) as error:
-            yield ResultState("calibration", name, "damaged", str(error))
-            continue
-        left = (one.valid_until - today).days
-        state = "expired" if left < 0 else "expires soon" if left < SOON_DAYS else "valid"
-        again = repeating.repeat_calibration(path.name, one, found.sessions)
-        detail = f"until {one.valid_until.isoformat()}, {left} days left"
-        yield ResultState("calibration", name, state, detail, "" if state == "valid" else again)
+            appearances[name] = store.read(path)
+        except store.StoreError as error:
+            del found.appearances[name]
+            results.append(_describe_damage("maps", name, error))
+    facts = read_session_facts(found.sessions)
+    for path in found.calibrations:
+        results += _read_calibrations(path, appearances, facts, today)
+    results += [_judge_maps(name, one, found) for name, one in appearances.items()]
+    results += _drop_damaged_rest(found, begin)
+    checks: list[page.Check] = []
+    progress("evaluate the checks")
+    evaluate_checks(found, checks)
+    steps = suggest(scan(folder), folder)
+    return FolderStatus(folder.absolute().name, tuple(results), tuple(checks), steps)
 
 
-def _read_maps(name: str, path: Path, found: ReportInputs) -> ResultState:
+def _describe_damage(kind: str, name: str, error: object) -> ResultState:
+    """Return the state of a damaged result, with its error on one line."""
+    return ResultState(kind, name, DAMAGED_STATE, " ".join(str(error).split()))
+
+
+def _read_session(path: Path, today: date) -> ResultState:
     try:
-        appearance = store.read(path)
-    except store.StoreError as error:
-        return ResultState("maps", name, "damaged", str(error))
+        report = verify(path, today=today)
+        if not report.ok:
+            return _describe_damage("session", path.name, report.problems[0])
+        session = Session.open(path)
+    except (SessionError, OSError, ValueError) as error:
+        return _describe_damage("session", path.name, error)
+    size = f"{format_count(report.frames, 'frame')}, {report.bytes / 1e6:.1f} MB"
+    expires = session.manifest.subject.consent_expires
+    if expires is not None and today > expires:
+        detail = f"{size}; on {expires.isoformat()}, do not use the data any more"
+        return ResultState("session", path.name, "consent expired", detail)
+    if missing := len(session.pending_frames()):
+        size += f"; {format_count(missing, 'frame')} of the plan missing"
+    if not session.closed:
+        return ResultState("session", path.name, "incomplete", f"{size}; not closed")
+    return ResultState("session", path.name, "sound", size)
+
+
+def _read_calibrations(
+    folder: Path,
+    appearances: Mapping[str, SkinAppearance],
+    sessions: Mapping[str, SessionFacts],
+    today: date,
+) -> Iterator[ResultState]:
+    """Yield the state of each calibration of a folder at the captures of its maps."""
+    for file in sorted(folder.glob("*.json")):
+        name = f"{folder.name}, {file.stem}"
+        try:
+            one = calibration_store.load(folder, file.stem)
+        except (CalibrationError, ValueError) as error:
+            yield _describe_damage("calibration", name, error)
+            continue
+        _, captured = list_uses(file, appearances, sessions)
+        outside = [day.isoformat() for day in captured if count_days_left(one, day) < 0]
+        detail = f"from {one.created.isoformat()} to {one.valid_until.isoformat()}"
+        if outside:
+            detail += f", captured on {', '.join(outside)}"
+        elif today > one.valid_until:
+            detail += "; capture its target again before further sessions"
+        state = "not valid at capture" if outside else "valid"
+        yield ResultState("calibration", name, state, detail)
+
+
+def _judge_maps(name: str, appearance: SkinAppearance, found: ReportInputs) -> ResultState:
+    """Return whether the calibrations that maps were made with are still those of a folder."""
     detail = format_count(len(appearance.maps), "map")
     if session := appearance.parameters.get("session"):
         detail += f" of {session}"
-    changed = _list_changed_calibrations(appearance, found)
+    place = repeating.find_session(appearance, found)
+    rig = None if place is None else place.rig.name
+    changed = [
+        kind
+        for kind, digest in sorted(repeating.list_used_calibrations(appearance).items())
+        if (now := repeating.hash_calibrations(kind, found, rig)) and digest not in now.values()
+    ]
     if not changed:
         return ResultState("maps", name, "up to date", detail)
-    detail += f"; calibrations {', '.join(changed)} have changed since"
-    return ResultState(
-        "maps", name, "out of date", detail, repeating.repeat_maps(name, appearance, found)
+    detail += f"; made with another calibration: {', '.join(changed)}"
+    again = repeating.repeat_maps(name, appearance, found)
+    return ResultState("maps", name, "out of date", detail, again)
+
+
+def _drop_damaged_rest(found: ReportInputs, begin: Callable[[Path], None]) -> Iterator[ResultState]:
+    """Remove damaged ground truths, images and documents from `found`, and yield their states."""
+
+    def read_images(folder: Path) -> None:
+        if (document := folder_document(folder)) is not None:
+            read_json(document)
+
+    truths = list(found.truths.values())
+    readers: tuple[tuple[str, list[Path], Callable[[Path], object]], ...] = (
+        ("ground truth", truths, store.read),
+        ("images", found.pictures, read_images),
+        ("document", found.documents, read_json),
     )
-
-
-def _list_changed_calibrations(appearance: SkinAppearance, found: ReportInputs) -> list[str]:
-    """Return the kinds of calibration behind the maps that no folder has any more.
-
-    Without any of them nearby, the maps may have come from elsewhere, and none is listed.
-    """
-    now = set().union(*(repeating.hash_files(one) for one in found.calibrations))
-    used = {
-        key.removeprefix(repeating.CALIBRATION_PREFIX): digest
-        for key, digest in appearance.inputs.items()
-        if key.startswith(repeating.CALIBRATION_PREFIX)
-    }
-    changed = sorted(kind for kind, digest in used.items() if digest not in now)
-    return changed if len(changed) < len(used) else []
+    for kind, places, read in readers:
+        for path in tuple(places):
+            begin(path)
+            try:
+                read(path)
+            except (store.StoreError, ReportError) as error:
+                places.remove(path)
+                yield _describe_damage(kind, path.name, error)
+    found.truths = {name: path for name, path in found.truths.items() if path in truths}
 
 
 def build_status_page(status: FolderStatus) -> str:
@@ -207,7 +245,7 @@ def build_status_page(status: FolderStatus) -> str:
                         one.name,
                         format_quantity(page.format_number(one.got), one.unit),
                         format_quantity(page.format_number(one.bound), one.unit),
-                        one.command or "unknown",
+                        one.command or "none known",
                     )
                     for one in status.missed
                 ],
@@ -216,13 +254,11 @@ def build_status_page(status: FolderStatus) -> str:
         )
     rows = [(one.command, one.why) for one in status.steps]
     lead.append(page.build_table(("command", "result"), rows, caption="Next steps"))
-    lead.append(page.build_note("Commands run in the folder that holds the results."))
-    kinds = {"session": "Sessions", "calibration": "Calibrations", "maps": "Maps"}
+    lead.append(page.build_note("Commands run in the folder where this page was made."))
     body: list[page.Block] = []
-    for kind, title in kinds.items():
+    for kind in dict.fromkeys(one.kind for one in status.results):
         own = [one for one in status.results if one.kind == kind]
-        if own:
-            body += [page.Heading(title, level=2), _table(f"State of {len(own)}", own)]
+        body += [page.Heading(kind.capitalize(), level=2), _table(f"State of {len(own)}", own)]
     if status.checks:
         body += [page.Heading("Checks", level=2), page.build_checks_table(status.checks)]
     return page.render_page(f"status of {status.name}", lead, body)

@@ -15,7 +15,6 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import hash_file
 from skinrig.arrays import Float64Array
 from skinrig.reporting import page
-from skinrig.reporting.repeating import repeat_calibration
 from skinrig.reporting.sections.session import SessionFacts
 
 MAX_LISTED_NUMBERS = 12
@@ -63,7 +62,6 @@ def section(
     appearances: Mapping[str, SkinAppearance],
     sessions: Mapping[str, SessionFacts],
     checks: list[page.Check],
-    places: Sequence[Path] = (),
 ) -> Iterator[page.Block]:
     """Yield quality, age at capture and values of calibrations.
 
@@ -77,8 +75,6 @@ def section(
         By name; their days give the age of a calibration.
     checks
         Gets the remaining validity of each folder that was used.
-    places
-        SESSION/ folders; those of targets repeat a calibration.
 
     Notes
     -----
@@ -91,27 +87,51 @@ def section(
     figures: list[tuple[object, ...]] = []
     values: list[page.Collapsible] = []
     for folder in folders:
-        left: list[tuple[float, str]] = []
+        left: list[float] = []
         for path in sorted(folder.glob("*.json")):
             try:
                 found = store.load(folder, path.stem)
             except (CalibrationError, ValueError) as error:
                 ages.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
-                left.append((float("nan"), ""))
+                left.append(float("nan"))
                 continue
             days, row = _age(folder.name, path, found, appearances, sessions)
             ages.append(row)
-            again = repeat_calibration(folder.name, found, places)
-            left += [(one, again) for one in days]
+            left += days
             figures += _figures(folder.name, found)
             values.append(_values(folder.name, found))
         if left:
             name = f"{folder.name}: days of validity left at capture"
-            least, again = min(left, key=lambda one: -np.inf if np.isnan(one[0]) else one[0])
-            checks.append(page.Check(name, least, 0.0, ">=", "d", command=again))
+            checks.append(page.Check(name, float(np.min(left)), 0.0, ">=", "d"))
     yield page.Heading("Calibrations", level=2)
     yield page.build_view("calibrations", ages=ages, figures=figures)
     yield from values
+
+
+def list_uses(
+    path: Path, appearances: Mapping[str, SkinAppearance], sessions: Mapping[str, SessionFacts]
+) -> tuple[list[str], list[date]]:
+    """Return the maps made with a calibration, and the days of their captures, each once.
+
+    Parameters
+    ----------
+    path
+        File of the calibration, which maps name by its digest.
+    appearances, sessions
+        By name; days of sessions that are not among them are unknown.
+    """
+    made_of = hash_file(path)
+    users = sorted(
+        name
+        for name, one in appearances.items()
+        if made_of in {str(d).removeprefix("sha256:") for d in one.inputs.values()}
+    )
+    captured = {
+        sessions[str(session)].day
+        for name in users
+        if (session := appearances[name].parameters.get("session")) in sessions
+    }
+    return users, sorted(captured)
 
 
 def _age(
@@ -122,20 +142,8 @@ def _age(
     sessions: Mapping[str, SessionFacts],
 ) -> tuple[list[float], tuple[object, ...]]:
     """Return the days left at each capture, and the row of the table."""
-    made_of = hash_file(path)
-    users = sorted(
-        name
-        for name, one in appearances.items()
-        if made_of in {str(d).removeprefix("sha256:") for d in one.inputs.values()}
-    )
-    captured = sorted(
-        {
-            sessions[str(session)].day
-            for name in users
-            if (session := appearances[name].parameters.get("session")) in sessions
-        }
-    )
-    days = [_days_left(found, day) for day in captured]
+    users, captured = list_uses(path, appearances, sessions)
+    days = [count_days_left(found, day) for day in captured]
     if not captured:
         verdict = "date of use unknown"
     elif min(days) < 0:
@@ -154,7 +162,7 @@ def _age(
     )
 
 
-def _days_left(found: Calibration, day: date) -> int:
+def count_days_left(found: Calibration, day: date) -> int:
     """Return days until validity ends; negative, too, before it began."""
     before = (day - found.created).days
     return before if before < 0 else (found.valid_until - day).days

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.reporting import page
+from skinrig.reporting.folders import ReportError
 from skinrig.simulating.effect_omission import is_omittable
 
 
@@ -33,10 +34,21 @@ class SessionFacts:
 
 
 def read_session_facts(folders: Sequence[Path]) -> dict[str, SessionFacts]:
-    """Return the facts that sessions record, by folder name."""
+    """Return the facts that sessions record, by folder name.
+
+    Raises
+    ------
+    skinrig.reporting.folders.ReportError
+        If a session's document is not JSON.
+    """
     found = {}
     for folder in folders:
-        document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+        try:
+            document = json.loads((folder / SESSION_FILE).read_bytes())
+        except ValueError as error:
+            raise ReportError(
+                f"{folder / SESSION_FILE}: is not JSON ({error}); restore it from a copy"
+            ) from error
         frames = list((folder / "frames").glob("*"))
         renderer = document.get("extra", {}).get("renderer", {})
         found[folder.name] = SessionFacts(
