@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import BoolArray, Float64Array
+from capture.calibration.led_sphere.arrow_system import ArrowSystem
 from capture.calibration.polarization import PolarizationError
 from capture.calibration.polarization.polarized_reflection import FacetReflection
 
@@ -193,45 +194,6 @@ def _starts(
     return [float(zeros[i]) for i in sorted(least, key=lambda i: cost[i])[:2]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ArrowSystem:
-    """Normal equations of two parameters of each light, and of three common ones."""
-
-    block: Float64Array  # of each light's own, (L, 2, 2)
-    border: Float64Array  # (L, 2, 3)
-    corner: Float64Array  # (3, 3)
-    one: Float64Array  # right sides, (L, 2)
-    other: Float64Array  # (3,)
-
-    def solve(
-        self, damping: float, otherwise: _ArrowSystem | None = None
-    ) -> tuple[Float64Array, Float64Array]:
-        """Return the parameters, with a damped diagonal.
-
-        Where the common ones have no minimum, they are those of ``otherwise``.
-        """
-        damped = self.block + damping * self.block * np.eye(2)
-        inverse = np.linalg.inv(damped)
-        through = inverse @ self.border
-        schur = self.corner + damping * np.diag(np.diag(self.corner))
-        schur = schur - np.einsum("kia,kib->ab", self.border, through)
-        local = np.einsum("kij,kj->ki", inverse, self.one)
-        right = self.other - np.einsum("kia,ki->a", self.border, local)
-        if otherwise is not None and np.linalg.eigvalsh(schur)[0] <= 0.0:
-            shared = otherwise.solve(damping)[1]
-        else:
-            shared = np.linalg.solve(schur, right)
-        return local - through @ shared, shared
-
-    def covariance(self) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Return covariances of each light's two parameters, with the common ones, and of those."""
-        inverse = np.linalg.inv(self.block)
-        through = inverse @ self.border
-        shared = np.linalg.inv(self.corner - np.einsum("kia,kib->ab", self.border, through))
-        both = -through @ shared
-        return inverse - both @ through.transpose(0, 2, 1), both, shared
-
-
 class _PolarizerProblem:
     """One descent: intensities and rotations of the lights, and three common parameters.
 
@@ -291,7 +253,7 @@ class _PolarizerProblem:
             (AXIS_T_DOF + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
         )
 
-    def _normal(self) -> tuple[_ArrowSystem, _ArrowSystem]:
+    def _normal(self) -> tuple[ArrowSystem, ArrowSystem]:
         """Return the equations of Gauss and Newton, and those with each light's curvature."""
         h = POLARIZER_DERIVATIVE_STEP
         u = self._transmitted(self.turn, self.shared)
@@ -329,7 +291,7 @@ class _PolarizerProblem:
         bent = np.linalg.det(curved) <= 1e-3 * np.linalg.det(block)
         curved[bent] = block[bent]
         rest = border, corner, one, other
-        return _ArrowSystem(block, *rest), _ArrowSystem(curved, *rest)
+        return ArrowSystem(block, *rest), ArrowSystem(curved, *rest)
 
     def solve(self) -> _PolarizerProblem:
         """Descend with Marquardt's damping; between steps fit the scatter of the axes."""
