@@ -150,7 +150,8 @@ V.drawEyes = (ctx, side, p, frame, fragment = "eye_fragment") => {
   const gl = V.gl;
   const plain = fragment !== "eye_fragment";
   const program = V.program(["mesh_attributes", "mesh_vertex"],
-    ["surface_varyings", ...(plain ? [] : ["shadow_lookup", "eye_noise"]), fragment], plain ? {} : V.eyeDefines());
+    ["surface_varyings", ...(plain ? [] : ["further_lights", "environment_light", "shadow_lookup", "eye_noise"]),
+      fragment], plain ? {} : V.eyeDefines());
   V.eyeBuffers(side, p).list.forEach((one, i) => {
     const {center} = V.lids[i];
     V.use(program, side, p, {...frame, u_ball: center, u_gaze: V.gaze(p, center, frame.u_eye),
