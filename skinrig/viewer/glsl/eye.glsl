@@ -108,7 +108,8 @@ void main() {
   vec3 bright = vec3(highlightFrom(key, u_to_light, wet, eye, alpha));
   for (int i = 0; i < 2; i++) {
     if (u_further_intensity[i] <= 0.0) continue;
-    float intensity = furtherIntensity(i, v_position - u_light_center);
+    // the rim of the socket shadows the eye from light behind it
+    float intensity = furtherIntensity(i, v_position - u_light_center) * smoothstep(-0.25, 0.05, u_further_to[i].z);
     irradiance += diffuseFrom(intensity, u_further_to[i], shading, beside, below);
     bright += highlightFrom(intensity, u_further_to[i], wet, eye, alpha);
   }
