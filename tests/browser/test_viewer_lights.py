@@ -173,4 +173,10 @@ def test_people_have_own_color_on_one_head(open_page):
     np.testing.assert_allclose(seen, albedo, rtol=0.1)
     covered = viewer.read("hair")[..., 3] > 0.5
     assert all(covered[:, k : k + 40].sum() > 20 for k in (0, 44, 88))
+    # hair and irises of darker skin have more melanin
+    colors = scene.facts["people_parts"]
+    assert colors[0]["iris"][2] > colors[1]["iris"][2]
+    hair = viewer.read("hair")
+    left, right = (hair[:, k : k + 40][covered[:, k : k + 40]] for k in (0, 88))
+    assert np.median(left[:, 0] / left[:, 3]) > 1.5 * np.median(right[:, 0] / right[:, 3])
     assert viewer.problems == []

@@ -10,7 +10,7 @@ V.ATTRIBUTES.a_coverage = 9;
 V.HAIR_POINTS = 5;
 
 V.haired = p => Boolean(V.hair) && (p.brows > 0.5 || p.hair > 0.5);
-V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
+V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery, p.person].join();
 
 V.registerFaceParts = () => {
   const at = V.groups.findIndex(([id]) => id === "expression") + 1;
@@ -56,16 +56,16 @@ V.start.push(() => {
     targets: () => ({hair: {format: "RGBA16F", size: V.screen(), space: "screen", filter: "nearest"}}),
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
-      const color = {u_absorption: parts.absorption, u_multiple: parts.multiple_scattering,
-        ...V.lightUniforms(ctx.p)};
+      const lights = V.lightUniforms(ctx.p);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       V.headShifts(ctx.p).forEach((shift, i) => {
         const camera = V.camera(ctx.p, ctx.size, shift);
         const p = V.headParams(ctx.p, i);
+        const {absorption, multiple_scattering: multiple} = V.partColors(p);
         V.drawHair(ctx, V.headSide(ctx.side, ctx.p, i), p, {u_view: camera.view,
           u_projection: camera.projection, u_eye: camera.eye, u_pixels: camera.pixelsPerMmAt1,
-          ...color});
+          u_absorption: absorption, u_multiple: multiple, ...lights});
       });
       gl.disable(gl.BLEND);
     },
