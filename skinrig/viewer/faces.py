@@ -236,7 +236,11 @@ def build_scene(
             return assemble_scene(source, provenance, progress)
         scene = assemble_scene(source, provenance | {"preset": ", ".join(people)}, progress)
         progress(f"people {', '.join(people[1:])}")
-        return scene.with_assets(_build_people(people, seed, size, surface))
+        scene = scene.with_assets(_build_people(people, seed, size, surface))
+        if "face_parts" not in scene.facts:
+            return scene
+        colors = [face_part_assets.build_colors(source.mesh, one, seed) for one in people]
+        return scene.with_assets({"facts": {"people_parts": colors}})
     found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin), progress)
     movement = "movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()

@@ -76,6 +76,20 @@ class ViewerPage:
         found = self.page.evaluate("() => window.viewer.statistics.passes")
         return {name: int(record["draws"]) for name, record in found.items()}
 
+    def wait_until(self, condition: str, value: Any = None) -> None:
+        """Wait until a JavaScript function of a value is true, 30 s at most."""
+        self.page.wait_for_function(condition, arg=value)
+
+    def wait_frames(self, count: int = 10) -> None:
+        """Wait for frames of the screen, in which a page that moves by itself draws."""
+        self.page.evaluate(
+            """count => new Promise(done => {
+              const step = () => count-- > 0 ? requestAnimationFrame(step) : done();
+              step();
+            })""",
+            count,
+        )
+
     def resize(self, width: int, height: int) -> None:
         """Change the size of the canvas in pixels."""
         self.page.evaluate("s => window.viewer.resize(s[0], s[1])", [width, height])

@@ -119,7 +119,7 @@ def test_reduced_motion_disables_automatic_movement(still):
     viewer = still
     draws = "() => window.viewer.statistics.draws"
     before = viewer.page.evaluate(draws)
-    viewer.page.wait_for_timeout(400)
+    viewer.wait_frames()
     assert viewer.page.evaluate(draws) == before
     moving = viewer.page.evaluate("() => document.getAnimations().length")
     assert moving == 0

@@ -32,10 +32,15 @@ def params(viewer: Any) -> dict[str, Any]:
     return dict(viewer.page.evaluate("() => window.viewer.params"))
 
 
-def spoken(viewer: Any) -> str:
-    """Return what a screen reader was told last."""
-    viewer.page.wait_for_timeout(450)
-    return str(viewer.page.locator("#live").text_content())
+def wait_for_announcement(viewer: Any, text: str) -> None:
+    """Wait until the page announces a text to screen readers."""
+    viewer.wait_until("text => document.getElementById('live').textContent.includes(text)", text)
+
+
+def reset(viewer: Any) -> None:
+    """Reset all controls, and wait until the address has no settings but the scene's own."""
+    viewer.page.locator("#reset").click()
+    viewer.wait_until("() => ['', '#relief=1'].includes(location.hash)")
 
 
 def opened(viewer: Any, group: str) -> Any:
@@ -90,7 +95,7 @@ def test_keys_rotate_camera_move_light_and_zoom(viewer):
     viewer.page.keyboard.press("l")
     viewer.page.keyboard.press("Shift+ArrowLeft")
     assert params(viewer)["light_azimuth_deg"] == start["light_azimuth_deg"] - 15
-    assert "Light 20 degrees" in spoken(viewer)
+    wait_for_announcement(viewer, "Light 20 degrees")
     viewer.page.keyboard.press("r")
     again = params(viewer)
     assert again["camera_yaw_deg"] == 0
@@ -112,10 +117,12 @@ def test_pixel_probe_reads_buffer_values(viewer):
     )
     assert rows["Melanosome volume fraction"] == f"{100 * inspect[2]:.2f} %"
     assert rows["Blood volume fraction"] == f"{100 * inspect[3]:.2f} %"
-    assert f"Melanosome volume fraction {rows['Melanosome volume fraction']}" in spoken(viewer)
+    melanin = rows["Melanosome volume fraction"]
+    wait_for_announcement(viewer, f"Melanosome volume fraction {melanin}")
     viewer.set(melanin_gain=2)
-    viewer.page.wait_for_timeout(400)
-    changed = viewer.page.locator("#reading dd").first.text_content()
+    first = "() => document.querySelector('#reading dd').textContent"
+    viewer.wait_until(f"old => ({first})() !== old", melanin)
+    changed = viewer.page.evaluate(first)
     assert float(changed.split()[0]) == pytest.approx(2 * 100 * inspect[2], abs=0.02)
 
 
@@ -209,7 +216,6 @@ def test_every_buffer_view_is_nonblank_on_face(viewer):
     assert len(options) >= len(viewer.buffers())
     for name in ("normal", "albedo", "irradiance", "chromophores", "specular"):
         select.select_option(value=json.dumps(name))
-        viewer.page.wait_for_timeout(50)
         shown = screen(viewer)
         assert params(viewer)["view"] == name
         assert shown[..., :3].std() > 8, name
@@ -228,10 +234,8 @@ def test_address_stores_and_restores_settings(viewer, procedural_html, open_page
     assert back["roughness"] == 1.25
     assert back["specular_model"] == "fitted"
     assert back["filmic"] is False
-    viewer.page.locator("#reset").click()
+    reset(viewer)
     assert params(viewer)["roughness"] == 1
-    viewer.page.wait_for_timeout(600)
-    assert viewer.page.evaluate("() => location.hash") in ("", "#relief=1")
 
 
 def test_address_with_invalid_parts_keeps_valid_parts(viewer):
@@ -249,8 +253,7 @@ def test_address_with_invalid_parts_keeps_valid_parts(viewer):
     assert found["weights"]["anger"] == 0.2
     assert found["camera_target_mm"] == [0, -22, -30]
     assert viewer.page.evaluate("() => ({}).x === undefined")
-    viewer.page.locator("#reset").click()
-    viewer.page.wait_for_timeout(600)
+    reset(viewer)
     assert viewer.problems == []
 
 
@@ -319,10 +322,8 @@ def test_canvas_follows_its_container_and_chosen_resolution(viewer):
     size = viewer.page.evaluate("() => [view.width, view.height]")
     assert max(size) == 384
     viewer.page.set_viewport_size({"width": 900, "height": 500})
-    viewer.page.wait_for_timeout(300)
-    changed = viewer.page.evaluate("() => [view.width, view.height]")
-    assert max(changed) == 384
-    assert changed != size
+    viewer.wait_until("old => view.width !== old[0] || view.height !== old[1]", size)
+    assert max(viewer.page.evaluate("() => [view.width, view.height]")) == 384
     viewer.page.set_viewport_size({"width": 720, "height": 560})
     viewer.set(resolution=0)
 

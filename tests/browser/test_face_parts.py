@@ -100,3 +100,52 @@ def test_hair_changes_only_pixels_it_covers(viewer):
     # brighter hair has less melanin, darker skin stays what it is behind uncovered pixels
     assert haired[covered > 0.9, :3].mean() < bald[covered > 0.9, :3].mean()
     assert viewer.problems == []
+
+
+NO_LIGHT = {"light_intensity": 0, "ambient": 0, "fill": 0, "rim": 0, "shadows": 0}
+PARTS = {**CLOSE, "eyes_open": 1, "hair": 1, "brows": 1}
+
+
+def read_parts(viewer, **params):
+    """Return irradiance and highlights, NaN but on eyes, (H, W, 3) each, and hair, (H, W, 4)."""
+    viewer.set(**(PARTS | NO_LIGHT | params))
+    eye = (viewer.read("albedo")[..., 3] > 0.0) & ~viewer.read("inspect")[..., :2].any(axis=-1)
+    found = [viewer.read(name)[..., :3] for name in ("irradiance", "specular")]
+    return (*(np.where(eye[..., None], one, np.nan) for one in found), viewer.read("hair"))
+
+
+def test_integrating_sphere_lights_eyes_and_hair(viewer):
+    """Radiance 1 from everywhere: at most 1 returns, and the eye's front has irradiance pi."""
+    irradiance, highlight, hair = read_parts(viewer, environment="uniform")
+    np.testing.assert_allclose(np.nanquantile(irradiance, 0.9), 1.0, atol=2e-3)
+    assert np.nanmax(irradiance) < 1.002
+    assert np.nanmin(irradiance) > 0.1  # below the upper lid and in the corners
+    # 0.025 straight ahead (Fresnel's reflection of tears), where no lid is near
+    assert np.nanmedian(highlight) == pytest.approx(0.025, rel=0.1)
+    covered = hair[..., 3] > 0.9
+    assert covered.sum() > 500
+    assert 0.002 < np.median(hair[covered, :3]) < hair[covered, :3].max() < 1.0
+    halves = read_parts(viewer, environment="uniform", environment_intensity=0.5)
+    np.testing.assert_allclose(halves[0], 0.5 * irradiance, rtol=1e-3)
+    np.testing.assert_allclose(halves[2][..., :3], 0.5 * hair[..., :3], atol=1e-3)
+
+
+def test_fill_on_eyes_equals_key_from_there(viewer):
+    """Light adds up: what fill adds is a key light of its direction and intensity.
+
+    Fill is 80 degrees from the key light, 8 above the horizon. The ball around the head shadows
+    none of the eye and brow on that side; light from behind reaches hair at the rim alone.
+    """
+    both = {"light_intensity": 2.0, "light_azimuth_deg": 35, "light_elevation_deg": 20}
+    key, filled, rimmed = (
+        read_parts(viewer, **both, **more) for more in ({}, {"fill": 0.5}, {"rim": 1.0})
+    )
+    alone = read_parts(viewer, light_intensity=1.0, light_azimuth_deg=-45, light_elevation_deg=8)
+    side = np.s_[:, :120]
+    np.testing.assert_allclose((filled[0] - key[0])[side], alone[0][side], atol=1e-5)
+    assert np.nanmax(alone[0][side]) > 0.5
+    brow = np.s_[60:110, :120, :3]
+    np.testing.assert_allclose((filled[2] - key[2])[brow], alone[2][brow], atol=2e-3)
+    assert alone[2][brow].max() > 0.02
+    np.testing.assert_array_equal(rimmed[0], key[0])
+    assert (rimmed[2] - key[2]).max() > 0.02

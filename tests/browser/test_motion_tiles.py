@@ -55,7 +55,7 @@ def test_window_shows_displacement_and_fetches_only_own_tiles(
         # back at the first place nothing is asked for again
         asked = len(served.requests)
         viewer.set(microstructure_at=[0.5, 0.7, 0], **settings)
-        viewer.page.wait_for_timeout(300)
+        viewer.wait_frames()
         assert served.requests[asked:] == []
         other = [p for p in viewer.problems if not p.startswith(f"request: {served.url}tiles/")]
         assert other == []

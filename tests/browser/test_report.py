@@ -168,12 +168,11 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
     chosen.nth(1).select_option(str(1 - int(chosen.nth(0).input_value())))
     dialog.get_by_role("button", name="Flip").click()
     assert difference.count() == 0
-    side = "() => document.querySelector('.stage').style.getPropertyValue('--divider')"
-    shown = set()
-    for _ in range(6):  # three seconds, 0.5 s each side
-        shown.add(page.evaluate(side))
-        page.wait_for_timeout(500)
-    assert shown == {"0%", "100%"}
+    for side in ("0%", "100%", "0%"):
+        page.wait_for_function(
+            "side => document.querySelector('.stage').style.getPropertyValue('--divider') === side",
+            arg=side,
+        )
     page.keyboard.press("Escape")
     page.locator("dialog").wait_for(state="detached")
     assert problems == []

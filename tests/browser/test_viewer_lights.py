@@ -122,15 +122,11 @@ def test_timeline_plays_blood_and_wrinkles_until_paused(viewer):
     assert np.abs(viewer.read("hemoglobin_rig") - blood).max() > 1e-3
     group.get_by_role("button", name="Play").press("Enter")
     time = "() => window.viewer.params.timeline_s"
-    for _ in range(40):
-        viewer.page.wait_for_timeout(100)
-        if viewer.page.evaluate(time) != 3.6:
-            break
-    assert viewer.page.evaluate(time) != 3.6
+    viewer.wait_until(f"() => ({time})() !== 3.6")
     group.get_by_role("button", name="Pause").press("Enter")
     assert group.get_by_role("button", name="Play").get_attribute("aria-pressed") == "false"
     paused = viewer.page.evaluate(time)
-    viewer.page.wait_for_timeout(400)
+    viewer.wait_frames()
     assert viewer.page.evaluate(time) == paused
 
 
@@ -150,11 +146,8 @@ def test_neutral_as_b_shows_difference_and_flips(viewer):
     viewer.set(weights={"anger": 1.0})
     assert np.abs(np.array(viewer.page.evaluate(pixels)) - 127.5).max() > 60
     view.get_by_role("button", name="Flip").click()
-    split = set()
-    for _ in range(8):
-        viewer.page.wait_for_timeout(500)
-        split.add(viewer.page.evaluate("() => window.viewer.params.split"))
-    assert split == {0, 1}
+    for split in (1, 0, 1):
+        viewer.wait_until("split => window.viewer.params.split === split", split)
     view.get_by_role("button", name="End").click()
     view.get_by_role("button", name="Scattering off as B").click()
     compared = viewer.page.evaluate("() => window.viewer.params.compare")
@@ -178,4 +171,12 @@ def test_people_have_own_color_on_one_head(open_page):
     thirds = [row[:, k : k + 40] for k in (0, 44, 88)]
     seen = [float(np.median(one[..., 1][one[..., 3] > 0.5])) for one in thirds]
     np.testing.assert_allclose(seen, albedo, rtol=0.1)
+    covered = viewer.read("hair")[..., 3] > 0.5
+    assert all(covered[:, k : k + 40].sum() > 20 for k in (0, 44, 88))
+    # hair and irises of darker skin have more melanin
+    colors = scene.facts["people_parts"]
+    assert colors[0]["iris"][2] > colors[1]["iris"][2]
+    hair = viewer.read("hair")
+    left, right = (hair[:, k : k + 40][covered[:, k : k + 40]] for k in (0, 88))
+    assert np.median(left[:, 0] / left[:, 3]) > 1.5 * np.median(right[:, 0] / right[:, 3])
     assert viewer.problems == []

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rigsim.face_parts import eyelids
 from rigsim.face_parts.hair import HAIR_KINDS, WIDTH_MM, Hair, draw_hair
+from rigsim.geometry.mesh import Mesh
 from skinrig.arrays import FloatArray
 from skinrig.viewer.scene import Assets, SceneSource
 
@@ -68,9 +69,7 @@ def build_assets(source: SceneSource) -> Assets:
         "hair_steps_per_mm": HAIR_STEPS_PER_MM,
         "counts": dict(zip(HAIR_KINDS, hair.counts, strict=True)),
         "width_mm": WIDTH_MM,
-        "absorption": hair.absorption_per_radius().tolist(),
-        "multiple_scattering": _multiple_scattering(hair).tolist(),
-        "iris": _iris_color(hair.iris_melanin),
+        **_describe_colors(hair),
         "eyes": eyes,
         "opening": EXPRESSION_OPENING,
         "sclera_radius_mm": eyelids.SCLERA_RADIUS_MM,
@@ -82,6 +81,32 @@ def build_assets(source: SceneSource) -> Assets:
     }
     params = {"eyes_open": 1, "eyes_follow": 1, "brows": 1, "hair": 1}
     return Assets(tables=tables, facts={"face_parts": facts}, params=params)
+
+
+def build_colors(mesh: Mesh, preset: str, seed: int) -> dict[str, list[float]]:
+    """Build the colors of hair and iris of another person on the same head.
+
+    Parameters
+    ----------
+    mesh
+        Simulated head.
+    preset, seed
+        Person, see `rigsim.face_parts.hair.draw_hair`.
+
+    Returns
+    -------
+    dict
+        Absorption per radius, albedo of multiple scattering, and linear sRGB of the iris.
+    """
+    return _describe_colors(draw_hair(mesh, preset, seed=seed))
+
+
+def _describe_colors(hair: Hair) -> dict[str, list[float]]:
+    return {
+        "absorption": hair.absorption_per_radius().tolist(),
+        "multiple_scattering": _multiple_scattering(hair).tolist(),
+        "iris": _iris_color(hair.iris_melanin),
+    }
 
 
 def _quantized(values_mm: FloatArray, steps_per_mm: float) -> NDArray[np.int16]:

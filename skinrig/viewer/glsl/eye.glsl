@@ -46,6 +46,16 @@ float glint(vec3 n, vec3 light, vec3 eye, float alpha) {
   float shade = facing / (mix(max(dot(n, light), 0.05), 1.0, 0.5 * alpha) * mix(max(dot(n, eye), 0.05), 1.0, 0.5 * alpha));
   return alpha * alpha / (PI * d * d) * fresnel * shade / (4.0 * max(facing, 0.02));
 }
+// Diffuse light and highlight of one light, of its intensity after shadows.
+float diffuseFrom(float intensity, vec3 light, vec3 n, vec3 beside, float below) {
+  float wrapped = clamp((dot(n, light) + 0.12) / 1.12, 0.0, 1.0);
+  // the cornea gathers light on the far side of the iris
+  float caustic = 1.0 - 0.5 * dot(beside, light - dot(light, u_gaze) * u_gaze) / 6.0;
+  return intensity * wrapped * caustic * mix(0.55, 1.0, below);
+}
+float highlightFrom(float intensity, vec3 light, vec3 n, vec3 eye, float alpha) {
+  return PI * intensity * max(dot(n, light), 0.0) * glint(n, light, eye, alpha);
+}
 void main() {
   vec3 way = normalize(v_position - u_eye);
   vec3 from = u_eye - u_ball;
@@ -72,14 +82,13 @@ void main() {
   // the sclera is bluish gray where the cornea begins
   float limbus = 1.0;
   vec3 albedo = sclera * mix(vec3(0.42, 0.44, 0.46), vec3(1.0), smoothstep(-0.1, 0.75, LIMBUS - dot(at, u_gaze)));
-  float caustic = 1.0;
+  vec3 beside = vec3(0.0);  // from the iris' center to the point that is seen of it
   if (cornea) {
     vec3 bent = refract(way, n, 1.0 / 1.336);
     vec3 iris = at + (IRIS - dot(at, u_gaze)) / min(dot(bent, u_gaze), -0.05) * bent;
     float reach;
     vec3 color = irisColor(iris, right, up, reach);
-    vec3 flat_light = u_to_light - dot(u_to_light, u_gaze) * u_gaze;
-    caustic = 1.0 - 0.5 * dot(iris - IRIS * u_gaze, flat_light) / 6.0;
+    beside = iris - IRIS * u_gaze;
     limbus = 1.0 - smoothstep(0.0, 0.28, dot(at, u_gaze) - LIMBUS);
     albedo = mix(color, albedo, limbus);
   }
@@ -90,18 +99,32 @@ void main() {
   float lit = litShare(v_position, normalize(round + vec3(0.0, 0.0, 0.6)));
   float below = smoothstep(-0.2, 3.4, v_normal.x);
   float open = mix(mix(0.30, 1.0, below), 0.75, edge) * (1.0 - 0.35 * inner) * (1.0 - 0.3 * outer);
-  float wrapped = clamp((dot(shading, u_to_light) + 0.12) / 1.12, 0.0, 1.0);
-  float direct = p_light_intensity * lit * wrapped * caustic * mix(0.55, 1.0, below);
-  o_irradiance = vec4(vec3(direct + p_ambient * open * (0.6 + 0.4 * round.y)), v_depth);
-  o_albedo = vec4(albedo, 1.0);
   vec3 eye = -way;
   vec3 wet = normalize(mix(n, edge_normal, edge) + 0.05 * off * (veins - 0.5));
   float alpha = cornea ? 0.05 : mix(0.14, 0.3, max(edge, off));
-  float bright = PI * p_light_intensity * lit * max(dot(wet, u_to_light), 0.0) * glint(wet, u_to_light, eye, alpha);
+  float key = p_light_intensity * lit;
+  vec3 irradiance = vec3(diffuseFrom(key, u_to_light, shading, beside, below)
+    + p_ambient * open * (0.6 + 0.4 * round.y));
+  vec3 bright = vec3(highlightFrom(key, u_to_light, wet, eye, alpha));
+  for (int i = 0; i < 2; i++) {
+    if (u_further_intensity[i] <= 0.0) continue;
+    // the rim of the socket shadows the eye from light behind it
+    float intensity = furtherIntensity(i, v_position - u_light_center) * smoothstep(-0.25, 0.05, u_further_to[i].z);
+    irradiance += diffuseFrom(intensity, u_further_to[i], shading, beside, below);
+    bright += highlightFrom(intensity, u_further_to[i], wet, eye, alpha);
+  }
   vec3 mirrored = reflect(-eye, wet);
   float base = 1.0 - max(dot(wet, eye), 0.0);
-  bright += open * p_ambient * (0.025 + 0.6 * pow(base, 5.0)) * (1.2 + 1.2 * mirrored.y);
-  o_specular = vec4(vec3(min(bright, 6.0)), 0.12);
+  float reflected = 0.025 + 0.6 * pow(base, 5.0);
+  bright += open * p_ambient * reflected * (1.2 + 1.2 * mirrored.y);
+  if (u_surrounded > 0.5) {
+    float a2 = alpha * alpha;
+    irradiance += open * environmentIrradiance(shading);
+    bright += open * reflected * environmentLight(mirrored, vec3(1.0, exp(-a2), exp(-4.0 * a2)));
+  }
+  o_irradiance = vec4(irradiance, v_depth);
+  o_albedo = vec4(albedo, 1.0);
+  o_specular = vec4(min(bright, 6.0), 0.12);
 }
 //@chunk eye_inspect_fragment
 // Not skin: no texture coordinates, no chromophores.

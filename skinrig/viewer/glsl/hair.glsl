@@ -19,6 +19,7 @@ void main() {
 }
 //@chunk undercoat_fragment
 uniform vec3 u_to_light;
+uniform vec3 u_light_center;
 uniform vec3 u_multiple;
 uniform vec2 u_shown;
 in float v_depth;
@@ -31,6 +32,11 @@ void main() {
   vec3 normal = normalize(v_normal);
   float direct = clamp(dot(normal, u_to_light), 0.0, 1.0);
   vec3 light = vec3(0.6 * p_light_intensity * direct + p_ambient * (0.5 + 0.3 * normal.y));
+  for (int i = 0; i < 2; i++) {
+    if (u_further_intensity[i] <= 0.0) continue;
+    light += 0.6 * furtherIntensity(i, v_position - u_light_center) * clamp(dot(normal, u_further_to[i]), 0.0, 1.0);
+  }
+  if (u_surrounded > 0.5) light += 0.6 * environmentIrradiance(normal);
   o_hair = vec4(covered * light * (u_multiple + 0.004), covered);
 }
 //@chunk hair_light
@@ -97,6 +103,7 @@ void main() {
 // scattering as the diffuse term of Kajiya and Kay 1989 with the albedo of Chiang et al. 2016.
 uniform vec3 u_eye;
 uniform vec3 u_to_light;
+uniform vec3 u_light_center;
 uniform vec3 u_absorption;
 uniform vec3 u_multiple;
 in vec3 v_position;
@@ -108,6 +115,37 @@ in float v_lit;
 layout(location = 0) out vec4 o_hair;
 float lobe(float x, float width) { return exp(-0.5 * x * x / (width * width)) / (2.5066 * width); }
 float hashed(vec2 at) { return fract(sin(dot(at, vec2(127.1, 311.7))) * 43758.5453); }
+struct Strand { vec3 along; vec3 toEye; vec3 normal; float shade; };
+vec3 insideAt(float cos_i) { return exp(-1.6 * u_absorption / max(cos_i, 0.3)); }
+vec3 diffuseOf(vec3 inside) { return u_multiple + 0.15 * inside * inside * inside; }
+// Radiance by one light, of its intensity after shadows.
+vec3 strandFrom(Strand s, float intensity, vec3 light) {
+  float sin_i = dot(s.along, light);
+  float sin_r = dot(s.along, s.toEye);
+  float cos_i = sqrt(max(1.0 - sin_i * sin_i, 0.0));
+  vec3 light_flat = light - sin_i * s.along;
+  vec3 eye_flat = s.toEye - sin_r * s.along;
+  float cos_phi = dot(light_flat, eye_flat) / max(length(light_flat) * length(eye_flat), 1e-3);
+  float half_cos = sqrt(clamp(0.5 + 0.5 * cos_phi, 0.0, 1.0));
+  float sum = sin_i + sin_r;
+  float base = 1.0 - sqrt(clamp(0.5 + 0.5 * dot(light, s.toEye), 0.0, 1.0));
+  float fresnel = 0.046 + 0.954 * pow(base, 5.0);
+  vec3 inside = insideAt(cos_i);
+  vec3 direct = vec3(lobe(sum + 0.12, 0.16) * 0.25 * half_cos * fresnel)
+    + lobe(sum - 0.06, 0.08) * exp(-3.65 * cos_phi - 3.98) * inside * 0.9
+    + lobe(sum - 0.18, 0.30) * exp(17.0 * cos_phi - 16.78) * inside * inside * 0.9 * fresnel * 4.0;
+  float facing = clamp((dot(s.normal, light) + 0.35) / 1.35, 0.0, 1.0);
+  return intensity * facing * s.shade * (PI * direct * cos_i + diffuseOf(inside) * cos_i);
+}
+// Radiance by the environment: the diffuse term, and R and TRT as the light around the direction that
+// mirrors the eye, times their integrals over directions. Other hair hides what TT transmits.
+vec3 strandSurrounded(Strand s) {
+  float sin_r = dot(s.along, s.toEye);
+  vec3 inside = insideAt(0.25 * PI);  // mean cosine of uniform directions
+  vec3 mirrored = -s.toEye + 2.0 * (s.toEye - sin_r * s.along);
+  vec3 lobes = (1.0 - sin_r * sin_r) * (0.07 + 0.13 * inside * inside);
+  return s.shade * (diffuseOf(inside) * environmentIrradiance(s.normal) + lobes * environmentIrradiance(mirrored));
+}
 void main() {
   if (hiddenBySkin(v_depth, 0.6)) discard;
   bool lock = v_fiber.w < 0.0;
@@ -123,28 +161,17 @@ void main() {
   } else {
     alpha *= 1.0 - smoothstep(0.85, 1.0, v_fiber.y);
   }
-  vec3 along = normalize(v_tangent);
-  vec3 to_eye = normalize(u_eye - v_position);
-  float sin_i = dot(along, u_to_light);
-  float sin_r = dot(along, to_eye);
-  float cos_i = sqrt(max(1.0 - sin_i * sin_i, 0.0));
-  vec3 light_flat = u_to_light - sin_i * along;
-  vec3 eye_flat = to_eye - sin_r * along;
-  float cos_phi = dot(light_flat, eye_flat) / max(length(light_flat) * length(eye_flat), 1e-3);
-  float half_cos = sqrt(clamp(0.5 + 0.5 * cos_phi, 0.0, 1.0));
-  float sum = sin_i + sin_r;
-  float base = 1.0 - sqrt(clamp(0.5 + 0.5 * dot(u_to_light, to_eye), 0.0, 1.0));
-  float fresnel = 0.046 + 0.954 * pow(base, 5.0);
-  vec3 inside = exp(-1.6 * u_absorption / max(cos_i, 0.3));
-  vec3 direct = vec3(lobe(sum + 0.12, 0.16) * 0.25 * half_cos * fresnel)
-    + lobe(sum - 0.06, 0.08) * exp(-3.65 * cos_phi - 3.98) * inside * 0.9
-    + lobe(sum - 0.18, 0.30) * exp(17.0 * cos_phi - 16.78) * inside * inside * 0.9 * fresnel * 4.0;
-  vec3 normal = normalize(v_normal);
-  float facing = clamp((dot(normal, u_to_light) + 0.35) / 1.35, 0.0, 1.0);
   // hair around a strand hides its root
   float depth_shade = lock ? mix(0.25, 1.0, smoothstep(0.0, 0.8, v_fiber.y)) : 0.55;
-  vec3 diffuse = (u_multiple + 0.15 * inside * inside * inside) * cos_i;
-  vec3 light = p_light_intensity * v_lit * facing * depth_shade * (PI * direct * cos_i + diffuse)
-    + p_ambient * depth_shade * (0.6 + 0.4 * normal.y) * (u_multiple + 0.15 * inside * inside * inside);
+  Strand s = Strand(normalize(v_tangent), normalize(u_eye - v_position), normalize(v_normal), depth_shade);
+  float sin_key = dot(s.along, u_to_light);
+  vec3 inside = insideAt(sqrt(max(1.0 - sin_key * sin_key, 0.0)));
+  vec3 light = strandFrom(s, p_light_intensity * v_lit, u_to_light)
+    + p_ambient * depth_shade * (0.6 + 0.4 * s.normal.y) * diffuseOf(inside);
+  for (int i = 0; i < 2; i++) {
+    if (u_further_intensity[i] <= 0.0) continue;
+    light += strandFrom(s, furtherIntensity(i, v_position - u_light_center), u_further_to[i]);
+  }
+  if (u_surrounded > 0.5) light += strandSurrounded(s);
   o_hair = vec4(alpha * tone * light, alpha);
 }

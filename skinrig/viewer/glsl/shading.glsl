@@ -55,6 +55,14 @@ float kelemenSpecular(SurfacePoint s, vec3 n) {
   float fresnel = p_f0 + (1.0 - p_f0) * base * base * base * base * base;
   return max(density * fresnel / dot(whole, whole), 0.0);
 }
+//@chunk further_lights
+// Fill and rim light. The head as a ball: light from behind does not reach the front.
+uniform vec3 u_further_to[2];
+uniform float u_further_intensity[2];
+float furtherIntensity(int i, vec3 from_center) {
+  float raised = dot(normalize(from_center), u_further_to[i]);
+  return u_further_intensity[i] * smoothstep(-0.3, 0.1, raised);
+}
 //@chunk environment_light
 // Spherical harmonics of the environment; bands are weighted by the kernel that blurs it.
 uniform vec3 u_environment[9];
@@ -69,7 +77,8 @@ vec3 environmentLight(vec3 d, vec3 bands) {
 }
 // Irradiance over pi (Ramamoorthi and Hanrahan 2001).
 vec3 environmentIrradiance(vec3 n) { return environmentLight(n, vec3(1.0, 2.0 / 3.0, 0.25)); }
-// Highlight: a lobe of roughness m around the mirror direction blurs band l by exp(-(l m)^2).
+//@chunk environment_highlight
+// A lobe of roughness m around the mirror direction blurs band l by exp(-(l m)^2).
 vec3 environmentHighlight(SurfacePoint s) {
   float cosine = clamp(dot(s.specularNormal, s.toEye), 0.0, 1.0);
   float m2 = s.roughness * s.roughness;
@@ -84,8 +93,6 @@ vec3 environmentHighlight(SurfacePoint s) {
 //@chunk surface_fragment
 uniform vec3 u_eye;
 uniform vec3 u_to_light;
-uniform vec3 u_further_to[2];
-uniform float u_further_intensity[2];
 in float v_depth;
 layout(location = 0) out vec4 o_irradiance;
 layout(location = 1) out vec4 o_albedo;
@@ -121,9 +128,7 @@ void main() {
   for (int i = 0; i < 2; i++) {
     if (u_further_intensity[i] <= 0.0) continue;
     s.toLight = u_further_to[i];
-    // the head as a ball: light from behind does not reach the front
-    float raised = dot(normalize(v_position - u_light_center), s.toLight);
-    float intensity = u_further_intensity[i] * smoothstep(-0.3, 0.1, raised);
+    float intensity = furtherIntensity(i, v_position - u_light_center);
     irradiance += intensity * clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
     float across = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
     specular += PI * intensity * across * surfaceSpecular(s);

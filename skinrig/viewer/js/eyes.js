@@ -9,6 +9,8 @@ Object.assign(V.defaults, {eyes_open: 0, eyes_follow: 1});
 // the conjunctiva behind the corners, and difference in depth below which it joins the sclera.
 V.EYES = {ROWS: 11, YAW: 26, UP: 16, DOWN: 20, MARGIN_MM: 0.35, SHEET_MM: 1.2, JOIN_MM: 3};
 
+// Colors of hair and iris: of a gallery, each person's own.
+V.partColors = p => V.scene.facts.people_parts?.[p.person] ?? V.scene.facts.face_parts;
 V.lidsOpen = p => Boolean(V.lids) && p.eyes_open > 0;
 V.opening = p => {
   const gains = V.scene.facts.face_parts.opening;
@@ -150,11 +152,12 @@ V.drawEyes = (ctx, side, p, frame, fragment = "eye_fragment") => {
   const gl = V.gl;
   const plain = fragment !== "eye_fragment";
   const program = V.program(["mesh_attributes", "mesh_vertex"],
-    ["surface_varyings", ...(plain ? [] : ["shadow_lookup", "eye_noise"]), fragment], plain ? {} : V.eyeDefines());
+    ["surface_varyings", ...(plain ? [] : ["further_lights", "environment_light", "shadow_lookup", "eye_noise"]),
+      fragment], plain ? {} : V.eyeDefines());
   V.eyeBuffers(side, p).list.forEach((one, i) => {
     const {center} = V.lids[i];
     V.use(program, side, p, {...frame, u_ball: center, u_gaze: V.gaze(p, center, frame.u_eye),
-      u_iris: V.scene.facts.face_parts.iris});
+      u_iris: V.partColors(p).iris});
     gl.bindVertexArray(one.vao);
     gl.drawElements(gl.TRIANGLES, one.count, gl.UNSIGNED_SHORT, 0);
   });

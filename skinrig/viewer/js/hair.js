@@ -10,7 +10,7 @@ V.ATTRIBUTES.a_coverage = 9;
 V.HAIR_POINTS = 5;
 
 V.haired = p => Boolean(V.hair) && (p.brows > 0.5 || p.hair > 0.5);
-V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery].join();
+V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery, p.person].join();
 
 V.registerFaceParts = () => {
   const at = V.groups.findIndex(([id]) => id === "expression") + 1;
@@ -52,21 +52,20 @@ V.start.push(() => {
   gl.bufferData(gl.ARRAY_BUFFER, table("hair_coverage"), gl.STATIC_DRAW);
   V.passes.push({
     name: "hair", after: ["surface", "shadow"], enabled: V.haired,
-    key: p => [V.hairKey(p), p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.ambient,
-      V.shadowed(p)].join(),
+    key: p => [V.hairKey(p), V.lightsKey(p), p.ambient, V.shadowed(p)].join(),
     targets: () => ({hair: {format: "RGBA16F", size: V.screen(), space: "screen", filter: "nearest"}}),
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
-      const color = {u_absorption: parts.absorption, u_multiple: parts.multiple_scattering,
-        u_to_light: V.direction(ctx.p.light_azimuth_deg, ctx.p.light_elevation_deg)};
+      const lights = V.lightUniforms(ctx.p);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       V.headShifts(ctx.p).forEach((shift, i) => {
         const camera = V.camera(ctx.p, ctx.size, shift);
         const p = V.headParams(ctx.p, i);
+        const {absorption, multiple_scattering: multiple} = V.partColors(p);
         V.drawHair(ctx, V.headSide(ctx.side, ctx.p, i), p, {u_view: camera.view,
           u_projection: camera.projection, u_eye: camera.eye, u_pixels: camera.pixelsPerMmAt1,
-          ...color});
+          u_absorption: absorption, u_multiple: multiple, ...lights});
       });
       gl.disable(gl.BLEND);
     },
@@ -160,15 +159,16 @@ V.drawHair = (ctx, side, p, uniforms) => {
   // all heads are hidden by the depth of the whole image
   const frame = {...uniforms, ...V.lightFrame(side, p),
     b_irradiance: ctx.side.buffers.get("irradiance").texture};
-  V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "shadow_lookup", "hair_depth",
-    "undercoat_fragment"], {PI: "3.14159265358979"}), side, p, {...frame, u_shown: [p.hair, p.brows]});
+  V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "further_lights",
+    "environment_light", "hair_depth", "undercoat_fragment"]), side, p, {...frame, u_shown: [p.hair, p.brows]});
   gl.bindVertexArray(mesh.vao);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
   gl.enableVertexAttribArray(V.ATTRIBUTES.a_coverage);
   gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 1, gl.UNSIGNED_BYTE, true, 0, 0);
   gl.drawElements(gl.TRIANGLES, mesh.count, V.faceType, 0);
   const made = V.hairBuffers(side, p);
-  V.use(V.program(["hair_light", "hair_vertex"], ["hair_depth", "hair_fragment"], {PI: "3.14159265358979"}),
+  V.use(V.program(["hair_light", "hair_vertex"],
+    ["further_lights", "environment_light", "hair_depth", "hair_fragment"], {PI: "3.14159265358979"}),
     side, p, frame);
   gl.bindVertexArray(made.vao);
   gl.drawElements(gl.TRIANGLES, made.indices, gl.UNSIGNED_INT, 0);

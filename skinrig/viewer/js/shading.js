@@ -81,8 +81,8 @@ V.start.push(() => {
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
       const program = V.program(["mesh_attributes", "mesh_vertex"], ["surface_varyings",
-        "surface_point", "skin_color", "kelemen_specular", "environment_light", "shadow_lookup",
-        ...V.surface.chunks,
+        "surface_point", "skin_color", "kelemen_specular", "further_lights", "environment_light",
+        "environment_highlight", "shadow_lookup", ...V.surface.chunks,
         V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
       V.drawHeads(ctx, program, V.lightUniforms(ctx.p), V.surface.parts);
     },
