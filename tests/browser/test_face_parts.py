@@ -53,6 +53,23 @@ def test_open_eye_is_masked_as_no_skin(viewer):
     assert (viewer.read("albedo")[lost][:, 3] > 0.0).all()
 
 
+def test_probe_reads_no_skin_on_eye_and_hair(viewer):
+    """Chromophores of an eye would be 0 %, those below hair are not visible."""
+    read = "([row, column]) => window.viewer.readings(column, row)"
+    viewer.set(**CLOSE)
+    skin = viewer.read("inspect")[..., :2].any(axis=-1)
+    viewer.set(eyes_open=1)
+    eyes = np.argwhere(skin & ~viewer.read("inspect")[..., :2].any(axis=-1))
+    at = [int(n) for n in eyes[len(eyes) // 2]]
+    assert viewer.page.evaluate(read, at)[0] == ["Eye", "not skin"]
+    viewer.set(eyes_open=0)
+    assert viewer.page.evaluate(read, at)[0][0] == "Melanosome volume fraction"
+    viewer.set(camera_distance_mm=620, camera_target_mm=[0, 0, 0], hair=1)
+    covered = np.argwhere(viewer.read("hair")[..., 3] > 0.9)
+    at = [int(n) for n in covered[len(covered) // 2]]
+    assert viewer.page.evaluate(read, at) == [["Hair", "not skin"]]
+
+
 def test_expression_moves_no_skin_into_eyes(viewer, procedural_scene):
     eyes = eyelids.build_eyelids(procedural_scene.mesh)
     for name in ("surprise", "disgust", "happiness"):

@@ -91,6 +91,7 @@ window.viewer = {
     const {width, height, channels, values} = V.readNow(name);
     return {width, height, channels, data: V.base64(values)};
   },
+  readings: (x, y) => V.readings(x, y),
   bench: V.bench,
   mesh: () => {
     const {positions, normals} = V.movedMesh(V.sideA, V.params);

@@ -27,8 +27,11 @@ V.triple = values => values.slice(0, 3).map(value => value.toFixed(3)).join(" ")
 
 // Rows [what, value]; empty outside the face.
 V.readings = (x, y) => {
-  const found = V.pixels(["inspect", "normal", "albedo", "irradiance", "specular"], x, y);
+  const found = V.pixels(["inspect", "normal", "albedo", "irradiance", "specular", "hair"], x, y);
+  if (found.hair?.[3] > 0.5) return [["Hair", "not skin"]];
   if (!found.irradiance || found.irradiance[3] <= 0) return [];
+  const depth = ["Depth", `${found.irradiance[3].toFixed(1)} mm`];
+  if (found.normal?.slice(0, 3).every(value => value === 0)) return [["Eye", "not skin"], depth];
   const rows = [];
   if (found.inspect) {
     rows.push(["Melanosome volume fraction", V.fraction(found.inspect[2])], ["Blood volume fraction", V.fraction(found.inspect[3])]);
@@ -37,7 +40,7 @@ V.readings = (x, y) => {
   if (found.specular) rows.push(["Specular", V.triple(found.specular)]);
   if (found.normal) rows.push(["Normal", V.triple(found.normal)]);
   if (found.inspect) rows.push(["Texture coordinates u, v", found.inspect.slice(0, 2).map(v => v.toFixed(3)).join(" ")]);
-  rows.push(["Depth", `${found.irradiance[3].toFixed(1)} mm`]);
+  rows.push(depth);
   return rows;
 };
 

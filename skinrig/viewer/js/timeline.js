@@ -22,13 +22,13 @@ V.seek = time => V.set({timeline_s: time, weights: V.timelineWeights(time)});
 // Play from where the timeline is; frames that the device cannot draw in time are omitted.
 V.play = () => {
   const begun = performance.now() - 1e3 * (V.params.timeline_s % V.timelineEnd());
+  const turn = V.playing = {};  // a later start ends this one
   const step = now => {
-    if (!V.playing) return;
+    if (V.playing !== turn) return;
     V.seek(((now - begun) / 1e3) % V.timelineEnd());
     // the pause lets slow devices answer buttons
     setTimeout(() => requestAnimationFrame(step), V.software() ? 50 : 0);
   };
-  V.playing = true;
   requestAnimationFrame(step);
 };
 
@@ -43,7 +43,7 @@ V.buildTimeline = box => {
   };
   button.onclick = () => {
     if (V.playing) {
-      V.playing = false;
+      V.playing = null;
       V.set({});
     } else V.play();
     show();
@@ -56,6 +56,6 @@ V.buildTimeline = box => {
   };
 };
 V.timelineChange = time => {
-  V.playing = false;
+  V.playing = null;
   return {timeline_s: time, weights: V.timelineWeights(time)};
 };
