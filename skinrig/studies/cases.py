@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, IntervalTrial
 from skinrig.console import to_json_value
-from skinrig.errors import format_error
+from skinrig.errors import UnusableError, format_error
 from skinrig.studies.description import MEDIUM, Case, software_hash
 
 RECORD_SCHEMA: Final = "skinrig.study_case/1"
@@ -149,9 +149,14 @@ def run_case(order: CaseOrder) -> CaseOutcome:
     work: Path | None = None
     try:
         if software_hash() != order.software:
-            raise RuntimeError(
+            raise UnusableError(
                 "worker: got another installation of skinrig than that of the study's command, "
                 "expected the same on every machine; install it there"
+            )
+        if order.case.key(order.software) != order.key:
+            raise UnusableError(
+                f"worker: got another content of {order.case.subject}, expected that of the "
+                "study's command; copy its files to the same path on every machine"
             )
         (order.out / WORK_FOLDER).mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f"{order.key}-", dir=order.out / WORK_FOLDER))

@@ -116,9 +116,10 @@ class Case:
         software
             See `software_hash`.
         """
-        content = canonical_json(
-            [dataclasses.asdict(self), _hash_subject_files(self.subject), software]
-        )
+        described = dataclasses.asdict(self)
+        if subject_file.is_subject_file(self.subject):  # its folder changes no result
+            described["subject"] = Path(self.subject).name
+        content = canonical_json([described, _hash_subject_files(self.subject), software])
         return hashlib.sha256(content).hexdigest()[:20]
 
 
@@ -161,9 +162,17 @@ class CaseGroup(Document):
         first, last = (found[1], found[2] or found[1]) if found else ("0", "-1")
         return range(int(first), int(last) + 1)
 
+    def list_subjects(self) -> list[str]:
+        """Return the subjects, files by absolute path: workers have working folders of their own."""
+        subjects = (one for text in self.subjects for one in expand_subjects(text))
+        return [
+            str(Path(one).absolute()) if subject_file.is_subject_file(one) else one
+            for one in subjects
+        ]
+
     def iterate_cases(self) -> Iterator[Case]:
         """Yield the cases, seed by seed."""
-        subjects = [one for text in self.subjects for one in expand_subjects(text)]
+        subjects = self.list_subjects()
         seeds = self.list_seeds()
         pairs = (
             itertools.product(subjects, seeds)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from reconstruction.pipeline import recipes
@@ -23,6 +23,22 @@ class ReconstructionOrder:
     landmarks: Path | None
     truth: str
     dome: DomeOptions
+
+    def with_absolute_paths(self) -> "ReconstructionOrder":
+        """Return the order with absolute paths, for a process whose working folder differs."""
+        dome = self.dome
+        return replace(
+            self,
+            session=self.session.absolute(),
+            out=self.out.absolute(),
+            calibration=_make_absolute(self.calibration),
+            landmarks=_make_absolute(self.landmarks),
+            dome=replace(dome, scan=_make_absolute(dome.scan), basis=_make_absolute(dome.basis)),
+        )
+
+
+def _make_absolute(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path).absolute()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +107,8 @@ def reconstruct_sessions(
                     progress(str(order.session), None)
                 yield reconstruct_session(order, progress)
             return
-        made = map_tiles(reconstruct_session, orders, executor=pool, window=max(len(orders), 1))
+        placed = [order.with_absolute_paths() for order in orders]
+        made = map_tiles(reconstruct_session, placed, executor=pool, window=max(len(orders), 1))
         try:
             for number, summary in enumerate(made):
                 progress(f"session {number + 1} of {len(orders)}: {orders[number].session}", None)

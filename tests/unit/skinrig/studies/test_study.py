@@ -9,6 +9,7 @@ from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
 from skinrig.errors import MissingExtra, UnusableError
 from skinrig.studies import executors
+from skinrig.studies.cases import CaseOrder, run_case
 from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
 from skinrig.studies.study import run_study
 
@@ -83,13 +84,45 @@ def test_key_depends_on_everything_that_matters():
     assert usual.key("a") == study_of(group()).list_cases()[0].key("a")
 
 
-def test_key_depends_on_content_of_subject_file(tmp_path):
-    person = tmp_path / "ann.toml"
+def write_person(path, melanin):
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f'schema = "skinrig.subject/1"\nmelanin = {melanin}\n', encoding="utf-8")
+    return study_of(group(subjects=(path.name,), seeds="1"))
+
+
+def test_key_depends_on_content_of_subject_file(tmp_path, monkeypatch):
     keys = []
-    for melanin in (0.02, 0.03):
-        person.write_text(f'schema = "skinrig.subject/1"\nmelanin = {melanin}\n', encoding="utf-8")
-        keys.append(study_of(group(subjects=(str(person),))).list_cases()[0].key("a"))
-    assert keys[0] != keys[1]
+    for folder, melanin in (("a", 0.02), ("b", 0.03), ("c", 0.02)):
+        study = write_person(tmp_path / folder / "ann.toml", melanin)
+        monkeypatch.chdir(tmp_path / folder)
+        (case,) = study.list_cases()
+        assert case.subject == str(tmp_path / folder / "ann.toml")
+        keys.append(case.key("a"))
+    assert keys[0] == keys[2] != keys[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda path: path, ""),
+        (lambda path: write_person(path, 0.03), "another content of"),
+        (lambda path: path.unlink(), "ann.toml"),
+    ],
+)
+def test_changed_subject_file_refuses_case(tmp_path, monkeypatch, change, word):
+    """A worker in another folder reads the file by its absolute path, and compares its content."""
+    study = write_person(tmp_path / "ann.toml", 0.02)
+    monkeypatch.chdir(tmp_path)
+    (case,) = study.list_cases()
+    order = CaseOrder(
+        *(case, case.key(software_hash()), tmp_path / "out", software_hash(), False),
+        *(judge_by_drawing, False),
+    )
+    (tmp_path / "worker").mkdir()
+    monkeypatch.chdir(tmp_path / "worker")
+    change(tmp_path / "ann.toml")
+    error = run_case(order).error
+    assert (word in error) if word else not error
 
 
 @pytest.mark.parametrize(
