@@ -19,7 +19,7 @@ from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, IntervalTrial
 from skinrig.console import to_json_value
 from skinrig.errors import UnusableError, format_error
-from skinrig.studies.description import MEDIUM, Case, software_hash
+from skinrig.studies.description import MEDIUM, Case, require_software
 
 RECORD_SCHEMA: Final = "skinrig.study_case/1"
 RECORDS_FOLDER: Final = "cases"
@@ -148,11 +148,7 @@ def run_case(order: CaseOrder) -> CaseOutcome:
     error = ""
     work: Path | None = None
     try:
-        if software_hash() != order.software:
-            raise UnusableError(
-                "worker: got another installation of skinrig than that of the study's command, "
-                "expected the same on every machine; install it there"
-            )
+        require_software(order.software)
         if order.case.key(order.software) != order.key:
             raise UnusableError(
                 f"worker: got another content of {order.case.subject}, expected that of the "

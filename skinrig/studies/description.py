@@ -30,6 +30,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from capture.calibration.record import DEFAULT_VALIDITY_DAYS
 from capture.documents import (
     Document,
     FaultCollector,
@@ -41,6 +42,7 @@ from capture.documents import (
 from capture.plan.rig_kinds import RIG_KINDS
 from rigsim.population import files as subject_file
 from rigsim.subject import pigment
+from skinrig.errors import UnusableError
 from skinrig.kernel_cache import PACKAGES_FOLDER
 from skinrig.simulating.orders import order_for
 
@@ -49,10 +51,13 @@ PACKAGES: Final = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 MEDIUM: Final = "medium"
 """Skin type of a homogeneous or anisotropic medium."""
 MAX_CASES: Final = 100_000
+MAX_AGE_DAYS: Final = DEFAULT_VALIDITY_DAYS - 1
+"""Oldest calibration: it is valid until the end of a simulation that passes midnight."""
 DEFAULT_WIDTHS_PX: Final = {"flash": 384, "dome": 320, "gradient": 128}
 _SEEDS = re.compile(r"(\d{1,9})(?:\.\.(\d{1,9}))?")
 _MEMBERS = re.compile(r"P(\d{2})\.\.P(\d{2})")
-_ANGLES = re.compile(r"ita:(-?[\d.]+)\.\.(-?[\d.]+)/([1-9]\d{0,4})")
+_MEMBER = re.compile(r"P\d+")
+_ANGLES = re.compile(r"ita:(-?\d+(?:\.\d+)?)\.\.(-?\d+(?:\.\d+)?)/([1-9]\d{0,4})")
 
 
 class StudyError(InputError):
@@ -148,7 +153,12 @@ class CaseGroup(Document):
         for name in ("subjects", "sizes", "calibration_age_days"):
             checks.check(name, "none", bool(getattr(self, name)), "at least one")
         ages = self.calibration_age_days
-        checks.check("calibration_age_days", ages, min(ages, default=0) >= 0, "days >= 0")
+        young = all(0 <= age <= MAX_AGE_DAYS for age in ages)
+        wanted = f"0 to {MAX_AGE_DAYS} days: calibrations expire"
+        checks.check("calibration_age_days", ages, young, wanted)
+        for text in self.subjects:
+            some = next(expand_subjects(text), None) is not None
+            checks.check("subjects", text, some, 'range "FIRST..LAST" with FIRST <= LAST')
         found = _SEEDS.fullmatch(self.seeds)
         ordered = found is not None and int(found[1]) <= int(found[2] or found[1])
         checks.check("seeds", self.seeds, ordered, 'text "FIRST..LAST" with FIRST <= LAST')
@@ -163,7 +173,7 @@ class CaseGroup(Document):
         return range(int(first), int(last) + 1)
 
     def list_subjects(self) -> list[str]:
-        """Return the subjects, files by absolute path: workers have working folders of their own."""
+        """Return the subjects; files by absolute path, as the folders of workers differ."""
         subjects = (one for text in self.subjects for one in expand_subjects(text))
         return [
             str(Path(one).absolute()) if subject_file.is_subject_file(one) else one
@@ -243,14 +253,18 @@ class StudyFile(Document):
         cases: dict[Case, None] = {}
         for number, group in enumerate(self.groups):
             try:
-                cases |= dict.fromkeys(group.iterate_cases())
                 for size in group.sizes:
                     _check_order(group, size)
+                for subject in group.list_subjects():
+                    _check_subject(group.rig, subject)
+                cases |= dict.fromkeys(group.iterate_cases())
             except ValueError as error:
                 if isinstance(error, StudyError):
                     raise
                 raise StudyError(
-                    f"groups[{number}]: {error}", where=where, advice="Correct this group."
+                    f"groups[{number}], rig {group.rig}: {error}",
+                    where=where,
+                    advice="Correct this group.",
                 ) from error
         return list(cases)
 
@@ -259,6 +273,16 @@ def _check_order(group: CaseGroup, size: CaseSize) -> None:
     """Raise if a rig's simulation refuses the options of a group."""
     options = {key: value for key, value in dataclasses.asdict(size).items() if value is not None}
     order_for(group.rig, out=Path("session"), leave_out=group.leave_out, **options)
+
+
+def _check_subject(rig: str, subject: str) -> None:
+    """Raise if a rig's simulation does not take a subject."""
+    if rig == "probe":
+        subject_file.load_tissue(subject, seed=0)
+    elif rig == "dome" and _MEMBER.fullmatch(subject):
+        subject_file.subject_melanin(subject, seed=0)
+    else:
+        subject_file.load_subject(subject)
 
 
 def read_study(path: Path) -> StudyFile:
@@ -337,3 +361,23 @@ def software_hash() -> str:
     }
     content = canonical_json([_hash_files(paths), libraries])
     return hashlib.sha256(content).hexdigest()[:20]
+
+
+def require_software(expected: str) -> None:
+    """Raise if this process has other software than the command that ordered its task.
+
+    Parameters
+    ----------
+    expected
+        `software_hash` of the command.
+
+    Raises
+    ------
+    UnusableError
+        If the hash here differs.
+    """
+    if software_hash() != expected:
+        raise UnusableError(
+            "worker: got another installation of skinrig than that of the command, "
+            "expected the same on every machine; install it there"
+        )

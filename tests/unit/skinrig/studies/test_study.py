@@ -8,7 +8,7 @@ import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
 from skinrig.errors import MissingExtra, UnusableError
-from skinrig.studies import executors
+from skinrig.studies import description, executors
 from skinrig.studies.cases import CaseOrder, run_case
 from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
 from skinrig.studies.study import run_study
@@ -133,6 +133,17 @@ def test_changed_subject_file_refuses_case(tmp_path, monkeypatch, change, word):
         ({"subjects": ()}, "subjects"),
         ({"subjects": ("XX",)}, "XX"),
         ({"subjects": ("homogeneous:1",), "rig": "probe"}, "homogeneous"),
+        ({"subjects": ("P60..P01",), "rig": "dome"}, "P60..P01"),
+        ({"subjects": ("P60..P01",), "rig": "dome", "every_seed": True}, "P60..P01"),
+        ({"subjects": ("ita:1.2.3..9/4",)}, "1.2.3"),
+        ({"subjects": ("P01",)}, "flash: subject: got 'P01'"),
+        ({"subjects": ("P01",), "rig": "gradient"}, "gradient: subject: got 'P01'"),
+        ({"subjects": ("P88",), "rig": "dome"}, "P88"),
+        ({"subjects": ("homogeneous:0.1,1",)}, "homogeneous:0.1,1"),
+        ({"subjects": ("homogeneous:0.1,1",), "rig": "dome"}, "homogeneous:0.1,1"),
+        ({"calibration_age_days": (0, -1)}, "0 to 89 days"),
+        ({"calibration_age_days": (90,)}, "0 to 89 days"),
+        ({"calibration_age_days": (10**10,)}, "0 to 89 days"),
         ({"seeds": "0..999999999"}, "at most"),
         ({"site": "nose"}, "site"),
         ({"leave_out": ("gold",)}, "gold"),
@@ -141,6 +152,18 @@ def test_changed_subject_file_refuses_case(tmp_path, monkeypatch, change, word):
 def test_faulty_group_names_fault(changes, word):
     with pytest.raises(StudyError, match=word):
         study_of(group(**changes)).list_cases()
+
+
+@pytest.mark.parametrize(
+    ("rig", "subject"),
+    [
+        *(("flash", "palest"), ("dome", "P87"), ("dome", "ita:20"), ("gradient", "monk:3")),
+        *(("probe", "P01"), ("probe", "anisotropic:0.1,1"), ("probe", "darkest")),
+    ],
+)
+def test_subject_that_rig_takes_is_case(rig, subject):
+    changes = {"rig": rig, "subjects": (subject,), "calibration_age_days": (89,)}
+    assert len(study_of(group(**changes, seeds="7")).list_cases()) == 1
 
 
 def test_second_run_does_no_work(written, tmp_path):
@@ -213,12 +236,11 @@ def test_second_writer_is_refused(written, tmp_path):
 
 
 def test_worker_with_other_software_refuses_case(written, tmp_path, monkeypatch):
-    from skinrig.studies import cases
-
-    monkeypatch.setattr(cases, "software_hash", lambda: "other")
+    monkeypatch.setattr(description, "software_hash", lambda: "other")
     run = run_study(read_study(written), tmp_path / "out", judge=judge_by_drawing)
     assert software_hash() != "other"
-    assert all("another installation" in text for text in run.errors.values())
+    assert set(run.errors) == set(run.cases)
+    assert all(text.startswith("worker: got another inst") for text in run.errors.values())
 
 
 @pytest.mark.parametrize("text", ["local", "local:0", "tcp://host", "processes", "local:x"])
