@@ -76,8 +76,9 @@ def run_far(*orders):
 
 
 def test_workers_get_orders_with_absolute_paths(far, order):
-    run_far(order)
+    _, lines = run_far(order)
     assert far == [order.with_absolute_paths()] != [order]
+    assert lines == ["sessions: 0/1", "sessions: 1/1, last session"]
 
 
 def test_session_that_ends_workers_is_named(far, order):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
+from skinrig.console import Console
 from skinrig.errors import MissingExtra, UnusableError
 from skinrig.studies import description, executors
 from skinrig.studies.cases import CaseOrder, run_case
@@ -186,10 +187,14 @@ def test_missing_and_damaged_records_are_made_again(written, tmp_path):
     assert results(out) == before
 
 
-def test_failed_case_is_row_and_runs_again(tmp_path):
+def test_failed_case_is_row_and_runs_again(tmp_path, capsys):
     study = study_of(group(subjects=("I", FAILING_SUBJECT), seeds="1..4"))
-    lines = []
-    first = run_study(study, tmp_path, judge=judge_by_drawing, progress=lines.append)
+    first = run_study(study, tmp_path, judge=judge_by_drawing, progress=Console(True).progress)
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    lines = [event["text"] for event in events]
+    assert lines[0] == "cases: 0/4"
+    assert lines[1] == "cases: 1/4, last flash I 1, 384 px"
+    assert [event["left_s"] is None for event in events] == [True, False, False, False, False]
     failures = [row["failure"] for row in table(tmp_path) if row["failure"]]
     assert failures == ["subject: got darkest, expected light"] * 2
     assert len(first.quantities) == 2
