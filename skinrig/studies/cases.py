@@ -19,7 +19,7 @@ from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, IntervalTrial
 from skinrig.console import to_json_value
 from skinrig.errors import UnusableError, format_error
-from skinrig.studies.description import MEDIUM, Case, require_software
+from skinrig.studies.description import MEDIUM_TYPE, Case, require_software
 
 RECORD_SCHEMA: Final = "skinrig.study_case/1"
 RECORDS_FOLDER: Final = "cases"
@@ -123,7 +123,7 @@ def judge_case(case: Case, folder: Path) -> Iterator[IntervalTrial]:
     options: dict[str, Any] = {"variant": variant}
     if case.rig == "probe":
         directed = case.subject.startswith("anisotropic:")
-        kind = "directed" if directed else "media" if case.skin == MEDIUM else "skin"
+        kind = "directed" if directed else "media" if case.skin == MEDIUM_TYPE else "skin"
         yield from rig.run_trials(folder, **{"media": {}, kind: people}, **options)
         return
     if case.rig == "flash":

@@ -47,8 +47,8 @@ from skinrig.kernel_cache import PACKAGES_FOLDER
 from skinrig.simulating.orders import order_for
 
 SCHEMA: Final = "skinrig.study/1"
-PACKAGES: Final = ("capture", "model", "reconstruction", "rigsim", "skinrig")
-MEDIUM: Final = "medium"
+HASHED_PACKAGES: Final = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+MEDIUM_TYPE: Final = "medium"
 """Skin type of a homogeneous or anisotropic medium."""
 MAX_CASES: Final = 100_000
 MAX_AGE_DAYS: Final = DEFAULT_VALIDITY_DAYS - 1
@@ -83,7 +83,7 @@ class Case:
     rig: str
     subject: str
     skin: str
-    """Preset of the nearest melanin, or `MEDIUM`."""
+    """Preset of the nearest melanin, or `MEDIUM_TYPE`."""
     seed: int
     """Seed of the subject, the rig as built, its calibration and all noise."""
     size: CaseSize
@@ -317,7 +317,7 @@ def expand_subjects(text: str) -> Iterator[str]:
 
 
 def skin_type(subject: str, *, seed: int) -> str:
-    """Return the preset of the melanin nearest to a subject's; `MEDIUM` for a medium.
+    """Return the preset of the melanin nearest to a subject's; `MEDIUM_TYPE` for a medium.
 
     Examples
     --------
@@ -326,7 +326,7 @@ def skin_type(subject: str, *, seed: int) -> str:
     """
     if subject.startswith(("homogeneous:", "anisotropic:")):
         subject_file.load_tissue(subject, seed=seed)
-        return MEDIUM
+        return MEDIUM_TYPE
     return pigment.nearest_preset(subject_file.subject_melanin(subject, seed=seed))
 
 
@@ -353,7 +353,7 @@ def software_hash() -> str:
     A result of other software is never taken for one of this.
     """
     paths: list[Path] = []
-    for package in PACKAGES:
+    for package in HASHED_PACKAGES:
         files = (PACKAGES_FOLDER / package).rglob("*")
         paths += sorted(p for p in files if p.is_file() and "__pycache__" not in p.parts)
     libraries: dict[str, Any] = {

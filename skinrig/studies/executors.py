@@ -75,7 +75,7 @@ def open_executor(text: str) -> Iterator[Executor | None]:
     MissingExtra
         If `distributed` is not installed.
     ExecutorLost
-        If there is no scheduler at the address.
+        Without a scheduler at the address.
     """
     if check_executor(text) == SERIAL_EXECUTOR:
         yield None
