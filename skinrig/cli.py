@@ -153,8 +153,9 @@ def main(argv: list[str] | None = None) -> int:
         _build_commands()(args=argv, standalone_mode=False)
         return errors.EXIT_DONE
     given = sys.argv[1:] if argv is None else argv
+    waits = errors.find_command(given) in WAITING_COMMANDS
     try:
-        with nullcontext() if {*given} & WAITING_COMMANDS else beat_while_running():
+        with nullcontext() if waits else beat_while_running():
             result = _build_commands()(args=argv, standalone_mode=False)
     except (typer.Exit, SystemExit) as stop:
         code = getattr(stop, "exit_code", None)

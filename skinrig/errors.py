@@ -161,6 +161,17 @@ RESUMABLE_COMMANDS = ("capture", "serve", "simulate")
 """Commands that have --resume."""
 
 
+def find_command(given: Sequence[str]) -> str:
+    """Return the name of the command in a command line; empty without one.
+
+    Examples
+    --------
+    >>> find_command(["--verbose", "report", "capture"])
+    'report'
+    """
+    return next((word for word in given if not word.startswith("-")), "")
+
+
 def format_interruption(given: Sequence[str]) -> str:
     """Return the message of an interrupted command.
 
@@ -176,7 +187,7 @@ def format_interruption(given: Sequence[str]) -> str:
     >>> format_interruption(["bench", "--out", "bench"])
     'interrupted; bench.json in --out keeps what was measured'
     """
-    command = next((word for word in given if not word.startswith("-")), "")
+    command = find_command(given)
     if command == "serve":  # it resumes from the session of its client, not from its own
         return "interrupted; serve with --resume SESSION to continue a session captured from it"
     if command in RESUMABLE_COMMANDS:

@@ -1,13 +1,13 @@
 """Kill commands with SIGKILL at random moments, repeat them, and compare the bytes.
 
-Each command runs once undisturbed. Then it is killed, repeated (`reconstruct`: the same command,
-`simulate`: with --resume) and killed until it ends. The seconds from its first step to the kill are
-drawn uniformly up to --span of the undisturbed run's. Its output is compared with the undisturbed
-one. Stages and tiles that begin again although they began before the kill are counted by the
-events of --json.
+Each command runs twice undisturbed; the first run fills the cache of compiled kernels. Then it is
+killed, repeated (`reconstruct`: the same command, `simulate`: with --resume) and killed until it
+ends. The seconds from its first step to the kill are drawn uniformly up to --span of the
+undisturbed run's. Its output is compared with the undisturbed one. Stages and tiles that begin
+again although they began before the kill are counted by the events of --json.
 
     skinrig demo --out DEMO
-    python tools/judge_resume.py DEMO --kills 50 --out record.json
+    python tools/judge_resume.py DEMO --kills 50 --work WORK
 """
 
 import argparse
@@ -221,11 +221,12 @@ def judge(
     out = work / "out"
     for name, (run, _) in runs.items():
         log = work / "whole.log"
-        if start([*run, "--out", str(out)], log).wait() != 0:
-            raise SystemExit(log.read_text())
-        events = read_events(log)
-        undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
-        remove_outputs(out)
+        for _ in ("compile", "judge"):
+            if start([*run, "--out", str(out)], log).wait() != 0:
+                raise SystemExit(log.read_text())
+            events = read_events(log)
+            undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
+            remove_outputs(out)
     for name in itertools.cycle(runs):
         if len(found) >= kills:
             break

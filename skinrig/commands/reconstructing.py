@@ -23,7 +23,7 @@ from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
 from skinrig.next_steps import shell_quote, suggest
-from skinrig.studies.executors import SERIAL_EXECUTOR, check_executor
+from skinrig.studies.executors import check_executor
 from skinrig.workspace import scan
 
 
@@ -185,15 +185,14 @@ def reconstruct(
     folders = assign_output_folders(sessions, out)
     found = [find_comparison_truth(session, state) for session in sessions]
     truths = [truth for truth in found if truth]
-    far = executor != SERIAL_EXECUTOR  # workers have folders of their own
     orders = [
         ReconstructionOrder(
-            session=session.absolute() if far else session,
+            session=session,
             want=tuple(wants),
-            out=folder.absolute() if far else folder,
-            calibration=calibration.absolute() if far and calibration else calibration,
+            out=folder,
+            calibration=calibration,
             state=state,
-            landmarks=landmarks.absolute() if far and landmarks else landmarks,
+            landmarks=landmarks,
             truth=truth.name if truth else "",
             dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )

@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, IntervalTrial
 from skinrig.console import to_json_value
-from skinrig.errors import format_error
-from skinrig.studies.description import MEDIUM, Case, software_hash
+from skinrig.errors import UnusableError, format_error
+from skinrig.studies.description import MEDIUM_TYPE, Case, require_software
 
 RECORD_SCHEMA: Final = "skinrig.study_case/1"
 RECORDS_FOLDER: Final = "cases"
@@ -123,7 +123,7 @@ def judge_case(case: Case, folder: Path) -> Iterator[IntervalTrial]:
     options: dict[str, Any] = {"variant": variant}
     if case.rig == "probe":
         directed = case.subject.startswith("anisotropic:")
-        kind = "directed" if directed else "media" if case.skin == MEDIUM else "skin"
+        kind = "directed" if directed else "media" if case.skin == MEDIUM_TYPE else "skin"
         yield from rig.run_trials(folder, **{"media": {}, kind: people}, **options)
         return
     if case.rig == "flash":
@@ -148,10 +148,11 @@ def run_case(order: CaseOrder) -> CaseOutcome:
     error = ""
     work: Path | None = None
     try:
-        if software_hash() != order.software:
-            raise RuntimeError(
-                "worker: got another installation of skinrig than that of the study's command, "
-                "expected the same on every machine; install it there"
+        require_software(order.software)
+        if order.case.key(order.software) != order.key:
+            raise UnusableError(
+                f"worker: got another content of {order.case.subject}, expected that of the "
+                "study's command; copy its files to the same path on every machine"
             )
         (order.out / WORK_FOLDER).mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f"{order.key}-", dir=order.out / WORK_FOLDER))

@@ -30,6 +30,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from capture.calibration.record import DEFAULT_VALIDITY_DAYS
 from capture.documents import (
     Document,
     FaultCollector,
@@ -41,18 +42,22 @@ from capture.documents import (
 from capture.plan.rig_kinds import RIG_KINDS
 from rigsim.population import files as subject_file
 from rigsim.subject import pigment
+from skinrig.errors import UnusableError
 from skinrig.kernel_cache import PACKAGES_FOLDER
 from skinrig.simulating.orders import order_for
 
 SCHEMA: Final = "skinrig.study/1"
-PACKAGES: Final = ("capture", "model", "reconstruction", "rigsim", "skinrig")
-MEDIUM: Final = "medium"
+HASHED_PACKAGES: Final = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+MEDIUM_TYPE: Final = "medium"
 """Skin type of a homogeneous or anisotropic medium."""
 MAX_CASES: Final = 100_000
+MAX_AGE_DAYS: Final = DEFAULT_VALIDITY_DAYS - 1
+"""Oldest calibration: it is valid until the end of a simulation that passes midnight."""
 DEFAULT_WIDTHS_PX: Final = {"flash": 384, "dome": 320, "gradient": 128}
 _SEEDS = re.compile(r"(\d{1,9})(?:\.\.(\d{1,9}))?")
 _MEMBERS = re.compile(r"P(\d{2})\.\.P(\d{2})")
-_ANGLES = re.compile(r"ita:(-?[\d.]+)\.\.(-?[\d.]+)/([1-9]\d{0,4})")
+_MEMBER = re.compile(r"P\d+")
+_ANGLES = re.compile(r"ita:(-?\d+(?:\.\d+)?)\.\.(-?\d+(?:\.\d+)?)/([1-9]\d{0,4})")
 
 
 class StudyError(InputError):
@@ -78,7 +83,7 @@ class Case:
     rig: str
     subject: str
     skin: str
-    """Preset of the nearest melanin, or `MEDIUM`."""
+    """Preset of the nearest melanin, or `MEDIUM_TYPE`."""
     seed: int
     """Seed of the subject, the rig as built, its calibration and all noise."""
     size: CaseSize
@@ -116,9 +121,10 @@ class Case:
         software
             See `software_hash`.
         """
-        content = canonical_json(
-            [dataclasses.asdict(self), _hash_subject_files(self.subject), software]
-        )
+        described = dataclasses.asdict(self)
+        if subject_file.is_subject_file(self.subject):  # its folder changes no result
+            described["subject"] = Path(self.subject).name
+        content = canonical_json([described, _hash_subject_files(self.subject), software])
         return hashlib.sha256(content).hexdigest()[:20]
 
 
@@ -147,7 +153,12 @@ class CaseGroup(Document):
         for name in ("subjects", "sizes", "calibration_age_days"):
             checks.check(name, "none", bool(getattr(self, name)), "at least one")
         ages = self.calibration_age_days
-        checks.check("calibration_age_days", ages, min(ages, default=0) >= 0, "days >= 0")
+        young = all(0 <= age <= MAX_AGE_DAYS for age in ages)
+        wanted = f"0 to {MAX_AGE_DAYS} days: calibrations expire"
+        checks.check("calibration_age_days", ages, young, wanted)
+        for text in self.subjects:
+            some = next(expand_subjects(text), None) is not None
+            checks.check("subjects", text, some, 'range "FIRST..LAST" with FIRST <= LAST')
         found = _SEEDS.fullmatch(self.seeds)
         ordered = found is not None and int(found[1]) <= int(found[2] or found[1])
         checks.check("seeds", self.seeds, ordered, 'text "FIRST..LAST" with FIRST <= LAST')
@@ -161,9 +172,17 @@ class CaseGroup(Document):
         first, last = (found[1], found[2] or found[1]) if found else ("0", "-1")
         return range(int(first), int(last) + 1)
 
+    def list_subjects(self) -> list[str]:
+        """Return the subjects; files by absolute path, as the folders of workers differ."""
+        subjects = (one for text in self.subjects for one in expand_subjects(text))
+        return [
+            str(Path(one).absolute()) if subject_file.is_subject_file(one) else one
+            for one in subjects
+        ]
+
     def iterate_cases(self) -> Iterator[Case]:
         """Yield the cases, seed by seed."""
-        subjects = [one for text in self.subjects for one in expand_subjects(text)]
+        subjects = self.list_subjects()
         seeds = self.list_seeds()
         pairs = (
             itertools.product(subjects, seeds)
@@ -234,14 +253,18 @@ class StudyFile(Document):
         cases: dict[Case, None] = {}
         for number, group in enumerate(self.groups):
             try:
-                cases |= dict.fromkeys(group.iterate_cases())
                 for size in group.sizes:
                     _check_order(group, size)
+                for subject in group.list_subjects():
+                    _check_subject(group.rig, subject)
+                cases |= dict.fromkeys(group.iterate_cases())
             except ValueError as error:
                 if isinstance(error, StudyError):
                     raise
                 raise StudyError(
-                    f"groups[{number}]: {error}", where=where, advice="Correct this group."
+                    f"groups[{number}], rig {group.rig}: {error}",
+                    where=where,
+                    advice="Correct this group.",
                 ) from error
         return list(cases)
 
@@ -250,6 +273,16 @@ def _check_order(group: CaseGroup, size: CaseSize) -> None:
     """Raise if a rig's simulation refuses the options of a group."""
     options = {key: value for key, value in dataclasses.asdict(size).items() if value is not None}
     order_for(group.rig, out=Path("session"), leave_out=group.leave_out, **options)
+
+
+def _check_subject(rig: str, subject: str) -> None:
+    """Raise if a rig's simulation does not take a subject."""
+    if rig == "probe":
+        subject_file.load_tissue(subject, seed=0)
+    elif rig == "dome" and _MEMBER.fullmatch(subject):
+        subject_file.subject_melanin(subject, seed=0)
+    else:
+        subject_file.load_subject(subject)
 
 
 def read_study(path: Path) -> StudyFile:
@@ -284,7 +317,7 @@ def expand_subjects(text: str) -> Iterator[str]:
 
 
 def skin_type(subject: str, *, seed: int) -> str:
-    """Return the preset of the melanin nearest to a subject's; `MEDIUM` for a medium.
+    """Return the preset of the melanin nearest to a subject's; `MEDIUM_TYPE` for a medium.
 
     Examples
     --------
@@ -293,7 +326,7 @@ def skin_type(subject: str, *, seed: int) -> str:
     """
     if subject.startswith(("homogeneous:", "anisotropic:")):
         subject_file.load_tissue(subject, seed=seed)
-        return MEDIUM
+        return MEDIUM_TYPE
     return pigment.nearest_preset(subject_file.subject_melanin(subject, seed=seed))
 
 
@@ -320,7 +353,7 @@ def software_hash() -> str:
     A result of other software is never taken for one of this.
     """
     paths: list[Path] = []
-    for package in PACKAGES:
+    for package in HASHED_PACKAGES:
         files = (PACKAGES_FOLDER / package).rglob("*")
         paths += sorted(p for p in files if p.is_file() and "__pycache__" not in p.parts)
     libraries: dict[str, Any] = {
@@ -328,3 +361,23 @@ def software_hash() -> str:
     }
     content = canonical_json([_hash_files(paths), libraries])
     return hashlib.sha256(content).hexdigest()[:20]
+
+
+def require_software(expected: str) -> None:
+    """Raise if this process has other software than the command that ordered its task.
+
+    Parameters
+    ----------
+    expected
+        `software_hash` of the command.
+
+    Raises
+    ------
+    UnusableError
+        If the hash here differs.
+    """
+    if software_hash() != expected:
+        raise UnusableError(
+            "worker: got another installation of skinrig than that of the command, "
+            "expected the same on every machine; install it there"
+        )

@@ -75,7 +75,7 @@ def open_executor(text: str) -> Iterator[Executor | None]:
     MissingExtra
         If `distributed` is not installed.
     ExecutorLost
-        If there is no scheduler at the address.
+        Without a scheduler at the address.
     """
     if check_executor(text) == SERIAL_EXECUTOR:
         yield None
@@ -114,6 +114,18 @@ def open_executor(text: str) -> Iterator[Executor | None]:
             where.close(timeout=10)
 
 
+def ended_workers(error: BaseException) -> bool:
+    """Return whether an executor gave a task up because it ended several workers.
+
+    Examples
+    --------
+    >>> ended_workers(ValueError("no memory"))
+    False
+    """
+    distributed = sys.modules.get("distributed")  # loaded where its errors occur
+    return distributed is not None and isinstance(error, distributed.KilledWorker)
+
+
 def describe_lost_task(error: BaseException) -> str:
     """Return why an executor could not run a task, for the task's row.
 
@@ -122,8 +134,7 @@ def describe_lost_task(error: BaseException) -> str:
     >>> describe_lost_task(ValueError("no memory"))
     'the worker failed (ValueError: no memory)'
     """
-    distributed = sys.modules.get("distributed")  # loaded where its errors occur
-    if distributed is not None and isinstance(error, distributed.KilledWorker):
+    if ended_workers(error):
         return (
             "the task ended several worker processes, by lack of memory or a crash; give workers "
             "more memory, or run it alone with --executor threads"

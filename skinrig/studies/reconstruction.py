@@ -2,13 +2,16 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from reconstruction.pipeline import recipes
 from reconstruction.pipeline.inputs import DomeOptions
 from reconstruction.tiles import map_tiles
-from skinrig.studies.executors import ExecutorLost, open_executor
+from skinrig.errors import UnusableError
+from skinrig.studies.description import require_software, software_hash
+from skinrig.studies.executors import ExecutorLost, describe_lost_task, ended_workers, open_executor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +26,22 @@ class ReconstructionOrder:
     landmarks: Path | None
     truth: str
     dome: DomeOptions
+
+    def with_absolute_paths(self) -> "ReconstructionOrder":
+        """Return the order with absolute paths, for a process whose working folder differs."""
+        dome = self.dome
+        return replace(
+            self,
+            session=self.session.absolute(),
+            out=self.out.absolute(),
+            calibration=_make_absolute(self.calibration),
+            landmarks=_make_absolute(self.landmarks),
+            dome=replace(dome, scan=_make_absolute(dome.scan), basis=_make_absolute(dome.basis)),
+        )
+
+
+def _make_absolute(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path).absolute()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +81,11 @@ def reconstruct_session(
     return ReconstructionSummary(done.ran, done.reused, done.omitted, done.assumed, done.work)
 
 
+def _reconstruct_on_worker(order: ReconstructionOrder, software: str) -> ReconstructionSummary:
+    require_software(software)
+    return reconstruct_session(order)
+
+
 def reconstruct_sessions(
     orders: Sequence[ReconstructionOrder],
     *,
@@ -77,12 +101,15 @@ def reconstruct_sessions(
     executor
         See `skinrig.studies.executors.open_executor`.
     progress
-        Called before each stage of a session in this process, or after each session elsewhere.
+        Called before each stage of a session in this process; elsewhere before the first session
+        and after each.
 
     Raises
     ------
     skinrig.studies.executors.ExecutorLost
         If the connection to the scheduler is lost; maps that were written stay.
+    skinrig.errors.UnusableError
+        If a session ends its workers, or a worker has other software than this process.
     """
     with open_executor(executor) as pool:
         if pool is None:
@@ -91,13 +118,24 @@ def reconstruct_sessions(
                     progress(str(order.session), None)
                 yield reconstruct_session(order, progress)
             return
-        made = map_tiles(reconstruct_session, orders, executor=pool, window=max(len(orders), 1))
+        placed = [order.with_absolute_paths() for order in orders]
+        work = partial(_reconstruct_on_worker, software=software_hash())
+        made = map_tiles(work, placed, executor=pool, window=max(len(orders), 1))
+        complete = 0
+        progress(f"sessions: 0/{len(orders)}", None)
         try:
-            for number, summary in enumerate(made):
-                progress(f"session {number + 1} of {len(orders)}: {orders[number].session}", None)
+            for summary in made:
+                session = orders[complete].session
+                complete += 1
+                progress(f"sessions: {complete}/{len(orders)}, last {session}", None)
                 yield summary
         except CancelledError as error:
             raise ExecutorLost(
                 f"--executor: the connection to the scheduler of {executor} was lost; run the "
                 "same command again, complete maps are reused"
             ) from error
+        except Exception as error:
+            if not ended_workers(error):
+                raise
+            lost = describe_lost_task(error)
+            raise UnusableError(f"{orders[complete].session}: {lost}") from error

@@ -19,14 +19,14 @@ from skinrig.benchmarks.intervals.coverage import (
 )
 from skinrig.console import to_json_value
 from skinrig.studies.cases import JudgedQuantity
-from skinrig.studies.description import MEDIUM, Case
+from skinrig.studies.description import MEDIUM_TYPE, Case
 
 RESULTS_SCHEMA: Final = "skinrig.study_results/1"
 TABLE_FILE: Final = "study.csv"
 DOCUMENT_FILE: Final = "study.json"
 PAGE_FILE: Final = "report.html"
-SKIN_TYPES: Final = (*PRESET_NAMES, MEDIUM)
-COLUMNS: Final = (
+SKIN_TYPES: Final = (*PRESET_NAMES, MEDIUM_TYPE)
+TABLE_COLUMNS: Final = (
     *("case", "rig", "subject", "skin", "seed", "variant", "quantity", "truths"),
     *("median_error", "half_width_68", "unit", "inside_68", "inside_95", "failure"),
 )
@@ -74,7 +74,7 @@ def format_table(
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow(TABLE_COLUMNS)
     for key, case in cases.items():
         head = (key, case.rig, case.subject, case.skin, case.seed, case.variant)
         for row in quantities.get(key, ()):

@@ -3,7 +3,6 @@
 import fcntl
 import os
 import shutil
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, as_completed
 from contextlib import contextmanager
@@ -71,7 +70,7 @@ def run_study(
     judge
         How a case is run, a function that workers can import.
     progress
-        Called with one line per case.
+        Called before the first case and after each, with their count, which gives the pace.
 
     Raises
     ------
@@ -95,7 +94,8 @@ def run_study(
         if done:
             progress(f"{len(done)} of {len(cases)} cases are complete already")
         errors: dict[str, str] = {}
-        ran, processor_s, begun_s = 0, 0.0, time.monotonic()
+        ran, processor_s = 0, 0.0
+        progress(f"cases: 0/{len(orders)}")
         try:
             for outcome in _run_orders(orders, executor):
                 ran += 1
@@ -105,12 +105,8 @@ def run_study(
                     errors[outcome.key] = outcome.error or "no record: is the folder shared?"
                 else:
                     done[outcome.key] = found
-                left_s = (time.monotonic() - begun_s) / ran * (len(orders) - ran)
-                state = errors.get(outcome.key) or f"{outcome.processor_s:.1f} processor s"
-                progress(
-                    f"case {ran} of {len(orders)}: {cases[outcome.key].name}: {state}; "
-                    f"about {left_s:.0f} s left"
-                )
+                failure = f": {errors[outcome.key]}" if outcome.key in errors else ""
+                progress(f"cases: {ran}/{len(orders)}, last {cases[outcome.key].name}{failure}")
         except ExecutorLost as error:
             raise ExecutorLost(
                 f"{error}; {len(done)} of {len(cases)} cases are complete: start a scheduler and "

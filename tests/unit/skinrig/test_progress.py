@@ -4,7 +4,11 @@ import io
 import json
 import pickle
 import time
+from contextlib import nullcontext
 
+import pytest
+
+from skinrig import cli
 from skinrig.console import Console
 from skinrig.progress import BEAT_S, Progress, beat_while_running, watch, watch_start
 
@@ -81,12 +85,32 @@ def test_thread_beats_only_while_command_runs():
 def test_late_first_step_reports_loading(capsys, monkeypatch):
     monkeypatch.setattr("skinrig.progress.BEAT_S", 0.0)
     watch_start(True)
+    err = ""
     with beat_while_running():
-        time.sleep(1.5)
+        deadline = time.monotonic() + 20.0
+        while not err and time.monotonic() < deadline:
+            time.sleep(0.01)
+            err = capsys.readouterr().err
         Console(True).print_line("done")
-    err = capsys.readouterr().err.splitlines()
-    assert json.loads(err[0])["text"] == "load the libraries"
-    assert err[-1] == "done"
+    assert json.loads(err.splitlines()[0])["text"] == "load the libraries"
+    assert capsys.readouterr().err.splitlines()[-1] == "done"
+
+
+@pytest.mark.parametrize(
+    ("argv", "beats"),
+    [
+        (["report", "capture", "--out", "r"], True),
+        (["--verbose", "report", "serve"], True),
+        (["capture", "no_rig"], False),
+        (["--verbose", "serve", "no_rig"], False),
+    ],
+)
+def test_commands_that_wait_report_no_beats(argv, beats, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    begun = []
+    monkeypatch.setattr(cli, "beat_while_running", lambda: nullcontext(begun.append(1)))
+    assert cli.main(argv) != 0
+    assert bool(begun) == beats
 
 
 def test_console_json_progress_is_one_event_per_line(capsys):

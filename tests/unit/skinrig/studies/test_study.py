@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
+from skinrig.console import Console
 from skinrig.errors import MissingExtra, UnusableError
-from skinrig.studies import executors
+from skinrig.studies import description, executors
+from skinrig.studies.cases import CaseOrder, run_case
 from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
 from skinrig.studies.study import run_study
 
@@ -83,13 +85,45 @@ def test_key_depends_on_everything_that_matters():
     assert usual.key("a") == study_of(group()).list_cases()[0].key("a")
 
 
-def test_key_depends_on_content_of_subject_file(tmp_path):
-    person = tmp_path / "ann.toml"
+def write_person(path, melanin):
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f'schema = "skinrig.subject/1"\nmelanin = {melanin}\n', encoding="utf-8")
+    return study_of(group(subjects=(path.name,), seeds="1"))
+
+
+def test_key_depends_on_content_of_subject_file(tmp_path, monkeypatch):
     keys = []
-    for melanin in (0.02, 0.03):
-        person.write_text(f'schema = "skinrig.subject/1"\nmelanin = {melanin}\n', encoding="utf-8")
-        keys.append(study_of(group(subjects=(str(person),))).list_cases()[0].key("a"))
-    assert keys[0] != keys[1]
+    for folder, melanin in (("a", 0.02), ("b", 0.03), ("c", 0.02)):
+        study = write_person(tmp_path / folder / "ann.toml", melanin)
+        monkeypatch.chdir(tmp_path / folder)
+        (case,) = study.list_cases()
+        assert case.subject == str(tmp_path / folder / "ann.toml")
+        keys.append(case.key("a"))
+    assert keys[0] == keys[2] != keys[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda path: path, ""),
+        (lambda path: write_person(path, 0.03), "another content of"),
+        (lambda path: path.unlink(), "ann.toml"),
+    ],
+)
+def test_changed_subject_file_refuses_case(tmp_path, monkeypatch, change, word):
+    """A worker in another folder reads the file by its absolute path, and compares its content."""
+    study = write_person(tmp_path / "ann.toml", 0.02)
+    monkeypatch.chdir(tmp_path)
+    (case,) = study.list_cases()
+    order = CaseOrder(
+        *(case, case.key(software_hash()), tmp_path / "out", software_hash(), False),
+        *(judge_by_drawing, False),
+    )
+    (tmp_path / "worker").mkdir()
+    monkeypatch.chdir(tmp_path / "worker")
+    change(tmp_path / "ann.toml")
+    error = run_case(order).error
+    assert (word in error) if word else not error
 
 
 @pytest.mark.parametrize(
@@ -100,6 +134,17 @@ def test_key_depends_on_content_of_subject_file(tmp_path):
         ({"subjects": ()}, "subjects"),
         ({"subjects": ("XX",)}, "XX"),
         ({"subjects": ("homogeneous:1",), "rig": "probe"}, "homogeneous"),
+        ({"subjects": ("P60..P01",), "rig": "dome"}, "P60..P01"),
+        ({"subjects": ("P60..P01",), "rig": "dome", "every_seed": True}, "P60..P01"),
+        ({"subjects": ("ita:1.2.3..9/4",)}, "1.2.3"),
+        ({"subjects": ("P01",)}, "flash: subject: got 'P01'"),
+        ({"subjects": ("P01",), "rig": "gradient"}, "gradient: subject: got 'P01'"),
+        ({"subjects": ("P88",), "rig": "dome"}, "P88"),
+        ({"subjects": ("homogeneous:0.1,1",)}, "homogeneous:0.1,1"),
+        ({"subjects": ("homogeneous:0.1,1",), "rig": "dome"}, "homogeneous:0.1,1"),
+        ({"calibration_age_days": (0, -1)}, "0 to 89 days"),
+        ({"calibration_age_days": (90,)}, "0 to 89 days"),
+        ({"calibration_age_days": (10**10,)}, "0 to 89 days"),
         ({"seeds": "0..999999999"}, "at most"),
         ({"site": "nose"}, "site"),
         ({"leave_out": ("gold",)}, "gold"),
@@ -108,6 +153,18 @@ def test_key_depends_on_content_of_subject_file(tmp_path):
 def test_faulty_group_names_fault(changes, word):
     with pytest.raises(StudyError, match=word):
         study_of(group(**changes)).list_cases()
+
+
+@pytest.mark.parametrize(
+    ("rig", "subject"),
+    [
+        *(("flash", "palest"), ("dome", "P87"), ("dome", "ita:20"), ("gradient", "monk:3")),
+        *(("probe", "P01"), ("probe", "anisotropic:0.1,1"), ("probe", "darkest")),
+    ],
+)
+def test_subject_that_rig_takes_is_case(rig, subject):
+    changes = {"rig": rig, "subjects": (subject,), "calibration_age_days": (89,)}
+    assert len(study_of(group(**changes, seeds="7")).list_cases()) == 1
 
 
 def test_second_run_does_no_work(written, tmp_path):
@@ -130,10 +187,14 @@ def test_missing_and_damaged_records_are_made_again(written, tmp_path):
     assert results(out) == before
 
 
-def test_failed_case_is_row_and_runs_again(tmp_path):
+def test_failed_case_is_row_and_runs_again(tmp_path, capsys):
     study = study_of(group(subjects=("I", FAILING_SUBJECT), seeds="1..4"))
-    lines = []
-    first = run_study(study, tmp_path, judge=judge_by_drawing, progress=lines.append)
+    first = run_study(study, tmp_path, judge=judge_by_drawing, progress=Console(True).progress)
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    lines = [event["text"] for event in events]
+    assert lines[0] == "cases: 0/4"
+    assert lines[1] == "cases: 1/4, last flash I 1, 384 px"
+    assert [event["left_s"] is None for event in events] == [True, False, False, False, False]
     failures = [row["failure"] for row in table(tmp_path) if row["failure"]]
     assert failures == ["subject: got darkest, expected light"] * 2
     assert len(first.quantities) == 2
@@ -180,12 +241,11 @@ def test_second_writer_is_refused(written, tmp_path):
 
 
 def test_worker_with_other_software_refuses_case(written, tmp_path, monkeypatch):
-    from skinrig.studies import cases
-
-    monkeypatch.setattr(cases, "software_hash", lambda: "other")
+    monkeypatch.setattr(description, "software_hash", lambda: "other")
     run = run_study(read_study(written), tmp_path / "out", judge=judge_by_drawing)
     assert software_hash() != "other"
-    assert all("another installation" in text for text in run.errors.values())
+    assert set(run.errors) == set(run.cases)
+    assert all(text.startswith("worker: got another inst") for text in run.errors.values())
 
 
 @pytest.mark.parametrize("text", ["local", "local:0", "tcp://host", "processes", "local:x"])
