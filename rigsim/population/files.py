@@ -16,8 +16,7 @@ beard            stubble of a member, 0 to 1; its own if omitted
 tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
                  "typical", or "papers" (the papers' model)
 epidermis_mm     thickness of the epidermis, mm, at equal melanin per area; this and the next ones
-                 replace those of the model, in the ranges of
-                 `rigsim.tissue.skin_layers.PROPERTY_RANGES`
+                 replace those of the model, in `rigsim.tissue.skin_layers.PROPERTY_RANGES`
 ...              site_contrast, basal_melanin_fraction, epidermal_blood_ratio, oxygenation,
                  scattering_per_mm, rayleigh_fraction, scattering_slope, baseline_amplitude,
                  eumelanin_fraction
@@ -337,7 +336,7 @@ def load_tissue(text: str, *, seed: int) -> ProbedTissue:
     if is_subject_file(text) or is_skin_tone(text) or text in PRESET_NAMES:
         return load_subject(text).tissue(seed=seed)
     if re.fullmatch(r"P\d+", text):
-        return SkinTissue(_member_skin(text))
+        return SkinTissue(load_member_skin(text))
     try:
         return parse_tissue(text, seed=seed)
     except TissueError as error:
@@ -346,27 +345,8 @@ def load_tissue(text: str, *, seed: int) -> ProbedTissue:
         raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
 
 
-def subject_melanin(text: str, *, seed: int) -> float:
-    """Return the volume fraction of melanosomes around which a subject's skin varies.
-
-    Parameters
-    ----------
-    text
-        A preset, a skin tone, a member of the population or a file.
-    seed
-        Seed of the variation between subjects.
-
-    Examples
-    --------
-    >>> subject_melanin("IV", seed=0), round(subject_melanin("P07", seed=0), 4)
-    (0.0395, 0.0148)
-    """
-    if re.fullmatch(r"P\d+", text):
-        return _member_skin(text).melanin
-    return load_subject(text).skin(seed=seed).melanin
-
-
-def _member_skin(name: str) -> PersonSkin:
+def load_member_skin(name: str) -> PersonSkin:
+    """Return the skin of a member of the population; an unknown name raises `TissueError`."""
     try:
         return get_member(name).skin
     except PopulationError as error:

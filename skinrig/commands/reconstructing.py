@@ -1,6 +1,7 @@
 """`skinrig calibrate` and `skinrig reconstruct`: calibrations and maps from sessions."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -115,20 +116,40 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class DomeMapOptions:
+    """Options of maps of a light dome.
+
+    Attributes
+    ----------
+    scan
+        Face mesh, PLY in mm; default: the session's own scan (dome).
+    merl_basis
+        Folder of MERL tables for the basis BRDFs; default: built-in materials (dome).
+    hold_out
+        Frames excluded from all fits: lights=L007,L023,views=C03 (dome).
+    rank
+        Number of basis BRDFs; default 4 (dome).
+    """
+
+    scan: Path | None = None
+    merl_basis: Path | None = None
+    hold_out: str | None = None
+    rank: int | None = None
+
+
 @command
 def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
     /,
+    *,
     maps: Annotated[str | None, typer.Option(autocompletion=completion.complete_wants)] = None,
     out: OptionalOut = None,
     list_maps: Annotated[bool, typer.Option("--list")] = False,
     calibration: Path | None = None,
     state: str = "neutral",
-    scan: Path | None = None,
-    merl_basis: Path | None = None,
     landmarks: Path | None = None,
-    hold_out: str | None = None,
-    rank: int | None = None,
+    dome: DomeMapOptions,
     executor: ExecutorName = "threads",
     json: Json = False,
 ) -> None:
@@ -146,16 +167,8 @@ def reconstruct(
         CALIBRATION/ folder; default: nominal values, listed as assumed (flash, photographs).
     state
         Expression or condition to reconstruct.
-    scan
-        Face mesh, PLY in mm; default: the session's own scan (dome).
-    merl_basis
-        Folder of MERL tables for the basis BRDFs; default: built-in materials (dome).
     landmarks
         CSV table name,x,y of the sites, in pixels of the 256 x 256 face map (probe).
-    hold_out
-        Frames excluded from all fits: lights=L007,L023,views=C03 (dome).
-    rank
-        Number of basis BRDFs; default 4 (dome).
     sessions
         SESSION/ folder; several are reconstructed one by one.
     maps
@@ -179,7 +192,7 @@ def reconstruct(
             "--list prints the maps of a session"
         )
     check_executor(executor)
-    check_rank(rank, merl_basis)
+    check_rank(dome.rank, dome.merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
     wants = replace_former_values(wants, FORMER_MAP_NAMES)
     folders = assign_output_folders(sessions, out)
@@ -194,7 +207,7 @@ def reconstruct(
             state=state,
             landmarks=landmarks,
             truth=truth.name if truth else "",
-            dome=DomeOptions(scan, merl_basis, hold_out, rank),
+            dome=DomeOptions(dome.scan, dome.merl_basis, dome.hold_out, dome.rank),
         )
         for session, folder, truth in zip(sessions, folders, found, strict=True)
     ]

@@ -41,6 +41,7 @@ from capture.documents import (
 )
 from capture.plan.rig_kinds import RIG_KINDS
 from rigsim.population import files as subject_file
+from rigsim.population.subject_melanin import subject_melanin
 from rigsim.subject import pigment
 from skinrig.errors import UnusableError
 from skinrig.kernel_cache import PACKAGES_FOLDER
@@ -280,7 +281,7 @@ def _check_subject(rig: str, subject: str) -> None:
     if rig == "probe":
         subject_file.load_tissue(subject, seed=0)
     elif rig == "dome" and _MEMBER.fullmatch(subject):
-        subject_file.subject_melanin(subject, seed=0)
+        subject_melanin(subject, seed=0)
     else:
         subject_file.load_subject(subject)
 
@@ -327,7 +328,7 @@ def skin_type(subject: str, *, seed: int) -> str:
     if subject.startswith(("homogeneous:", "anisotropic:")):
         subject_file.load_tissue(subject, seed=seed)
         return MEDIUM_TYPE
-    return pigment.nearest_preset(subject_file.subject_melanin(subject, seed=seed))
+    return pigment.nearest_preset(subject_melanin(subject, seed=seed))
 
 
 def _hash_subject_files(subject: str) -> str:

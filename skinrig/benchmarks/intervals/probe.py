@@ -12,7 +12,7 @@ from model.skin import SkinAppearance
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
-from rigsim.population.files import subject_melanin
+from rigsim.population.subject_melanin import subject_melanin
 from skinrig.benchmarks.intervals.coverage import IntervalTrial
 from skinrig.benchmarks.intervals.trials import (
     USUAL_CAPTURE,
