@@ -21,10 +21,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import metadata, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from reconstruction.pipeline.library_versions import list_library_versions
 from reconstruction.pipeline.product_file import (
     PRODUCT_PACKAGES,
     DamagedFileError,
@@ -42,7 +43,6 @@ BYTES_PER_S: Final = 2.5e8
 """Assumed rate of storing before the first file is written, with checksum."""
 FILE_S: Final = 1e-3
 """Seconds to make a file."""
-HASHED_VERSIONS: Final = ("skinrig", "numpy", "scipy", "numba")
 _LOCK_FILE: Final = "lock"
 _RUN_FILE: Final = "run"
 _SCRATCH_SUFFIX: Final = ".scratch"
@@ -54,10 +54,10 @@ class BusyError(ValueError):
 
 @cache
 def code_digest() -> str:
-    """Hash the code and data of the packages that determine a map, and the versions of others."""
+    """Hash the code and data of the packages that determine a map, and the libraries' versions."""
     digest = hashlib.sha256()
-    for name in HASHED_VERSIONS:
-        digest.update(f"{name} {metadata.version(name)}\0".encode())
+    for name, version in list_library_versions().items():
+        digest.update(f"{name} {version}\0".encode())
     for package in PRODUCT_PACKAGES:
         root = Path(str(resources.files(package)))
         for path in sorted(root.rglob("*")):

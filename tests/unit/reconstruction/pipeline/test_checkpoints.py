@@ -196,3 +196,12 @@ def test_foreign_files_of_work_folder_are_kept(tmp_path):
     assert note.read_text() == "keep"
     assert len(list(note.parent.glob("*.npz"))) == N_TILES + 3
     shutil.rmtree(note.parent)
+
+
+def test_code_digest_changes_with_library_version(monkeypatch):
+    monkeypatch.setattr(module, "PRODUCT_PACKAGES", ())
+    found = set()
+    for version in ("1", "2"):
+        monkeypatch.setattr(module, "list_library_versions", lambda: {"trimesh": version})  # noqa: B023
+        found.add(module.code_digest.__wrapped__())
+    assert len(found) == 2
