@@ -209,7 +209,7 @@ def test_second_run_is_refused_before_first_store(tmp_path):
     assert Second(tmp_path / "out").run() == expected
 
 
-def test_lock_removed_while_opened_is_taken_anew(tmp_path, monkeypatch):
+def test_lock_removed_while_opened_is_replaced(tmp_path, monkeypatch):
     """A process that opened the lock of a finishing run must not lock the removed file."""
     first = Checkpoints(tmp_path / "work", "", RunRecord([], {}, {}))
     first._open()
