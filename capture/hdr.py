@@ -404,7 +404,7 @@ def _merge_tiles(  # type: ignore[no-untyped-def]
             variance[start + i] = per_time * per_time / w[i] if good else np.float32(np.nan)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
+@njit(error_model="numpy", fastmath=_FAST_MATH, forceinline=True)
 def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tile of one frame with the weight of read noise alone."""
     for i in range(len(s)):
@@ -414,7 +414,7 @@ def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
         w[i] += usable * t
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
+@njit(error_model="numpy", fastmath=_FAST_MATH, forceinline=True)
 def _add_weighted(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tile of one frame with its time over its variance as weight."""
     for i in range(len(s)):
@@ -424,7 +424,7 @@ def _add_weighted(frame, t, first, floor, black, white, s, w):  # type: ignore[n
         w[i] += weight * t
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
+@njit(error_model="numpy", fastmath=_FAST_MATH, forceinline=True)
 def _add_pair(one, two, t, u, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tiles of two frames with one division for both: a / x + b / y = (a y + b x) / x y."""
     for i in range(len(s)):

@@ -136,6 +136,10 @@ def require_free(path: str | Path) -> None:
         When ``path`` exists and is something else, or its parent folder cannot be written to.
     """
     target = Path(path)
+    if target.name in ("", ".."):
+        raise StoreError(
+            f"{target}: got a folder without a name of its own, expected one; give its full path"
+        )
     if target.exists() and not (target / DOCUMENT_FILE).is_file() and any(_entries(target)):
         raise StoreError(
             f"{target}: exists and is not an APPEARANCE/ folder; nothing was written: name another"

@@ -166,6 +166,19 @@ def basis_from_columns(
     return _pad_table(np.asarray(columns, np.float64), names, light_radius_rad)
 
 
+def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return a folder's .binary files (upper or lower case) by name; none of a missing folder.
+
+    Examples
+    --------
+    >>> list_material_files("/proc/none")
+    []
+    """
+    place = Path(folder)
+    found = place.iterdir() if place.is_dir() else []
+    return sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
+
+
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
     """Return a basis of the MERL files in a folder, their channels averaged to one.
 
@@ -184,9 +197,7 @@ def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS
     model.merl.MerlFileError
         When one of them is not a MERL table.
     """
-    place = Path(folder)
-    found = place.iterdir() if place.is_dir() else []
-    paths = sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
+    paths = list_material_files(folder)
     if not paths:
         raise BasisError(f"{folder}: got no .binary files, expected MERL tables; name their folder")
     columns = [_read_material(path, light_radius_rad) for path in paths]

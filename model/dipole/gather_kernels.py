@@ -38,7 +38,7 @@ def _decay(x):
     return p * p
 
 
-@njit(fastmath=_FAST_MATH, error_model="numpy")
+@njit(fastmath=_FAST_MATH, error_model="numpy", forceinline=True)
 def _far(count, away2, area, light, pull, medium, total):
     """Add light and mass of a buffer in one channel, including the light's first moments."""
     sigma, depth, height, scale = medium

@@ -15,7 +15,7 @@ def _counts(image, y, x):
     return np.isfinite(h[y, x]) and (not masked or valid[y, x] != 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
+@njit(error_model="numpy", fastmath={"reassoc"}, forceinline=True)
 def _sum_about(row, about):
     """Return the sum of the differences from a value."""
     total = 0.0
@@ -77,7 +77,7 @@ def _finish(s1, s2, whole, about, rounding, mean, deviation):
     return doubtful
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
+@njit(error_model="numpy", fastmath={"reassoc"}, forceinline=True)
 def _moments_of(row, about):
     """Return number, sum and sum of squares about a value of the finite entries."""
     n, s1, s2 = 0, 0.0, 0.0
@@ -91,7 +91,7 @@ def _moments_of(row, about):
     return n, s1, s2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
+@njit(error_model="numpy", fastmath={"reassoc"}, forceinline=True)
 def _valid_moments_of(row, valid, about):
     """Return `_moments_of` over the valid entries."""
     n, s1, s2 = 0, 0.0, 0.0

@@ -131,7 +131,7 @@ def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):
         used += 1
 
 
-@njit(nogil=True, fastmath=FAST_MATH)
+@njit(fastmath=FAST_MATH, forceinline=True)
 def _misfit(column, x, size, target, count, residual):  # type: ignore[no-untyped-def]
     """Fill target - columns x, return its norm."""
     for i in range(count):

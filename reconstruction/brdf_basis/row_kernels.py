@@ -26,7 +26,7 @@ def _angle(c):  # type: ignore[no-untyped-def]
     return math.sqrt(max(1.0 - c, 0.0)) * p / _HALF_PI
 
 
-@njit(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp", "nnan"})
+@njit(fastmath={"contract", "reassoc", "nsz", "arcp", "nnan"}, forceinline=True)
 def find_nodes(light, view, normal, picked, count, cos_l, node_position):  # type: ignore[no-untyped-def]
     """Fill the cosine of the light and the position on the table's axes of the picked samples."""
     n0, n1, n2 = float64(normal[0]), float64(normal[1]), float64(normal[2])
@@ -54,7 +54,7 @@ def find_nodes(light, view, normal, picked, count, cos_l, node_position):  # typ
 def _row_filler(fixed: int) -> Callable[..., Any]:
     """Return the kernel that fills a matrix; one of fixed width is unrolled to vectors."""
 
-    @njit(nogil=True, fastmath=FAST_MATH)
+    @njit(fastmath=FAST_MATH, forceinline=True)
     def fill(flat, cos_l, place, weight, count, rows, square):  # type: ignore[no-untyped-def]
         """Fill the matrix and the weighted squares of its columns."""
         lanes = uint64(fixed) if fixed > 0 else uint64(rows.shape[1])
@@ -95,7 +95,7 @@ fill_16 = _row_filler(16)
 fill_any = _row_filler(0)
 
 
-@njit(nogil=True, fastmath=FAST_MATH)
+@njit(fastmath=FAST_MATH, forceinline=True)
 def multiply_transpose(rows, force, count, total):  # type: ignore[no-untyped-def]
     """Fill the matrix' transpose times ``force``, in blocks of float32 summed in float64."""
     lanes = rows.shape[1]
@@ -119,7 +119,7 @@ def multiply_transpose(rows, force, count, total):  # type: ignore[no-untyped-de
             total[k] += block[k]
 
 
-@njit(nogil=True, fastmath=FAST_MATH)
+@njit(fastmath=FAST_MATH, forceinline=True)
 def weighted_column_norms(rows, weight, count, total):  # type: ignore[no-untyped-def]
     """Fill the weighted square of each column."""
     lanes = rows.shape[1]
@@ -135,7 +135,7 @@ def weighted_column_norms(rows, weight, count, total):  # type: ignore[no-untype
             total[k] += block[k]
 
 
-@njit(nogil=True, fastmath=FAST_MATH)
+@njit(fastmath=FAST_MATH, forceinline=True)
 def dot(a, b, count):  # type: ignore[no-untyped-def]
     """Return the inner product of the first `count` elements."""
     total = float32(0.0)
@@ -144,7 +144,7 @@ def dot(a, b, count):  # type: ignore[no-untyped-def]
     return float64(total)
 
 
-@njit(nogil=True, fastmath=FAST_MATH)
+@njit(fastmath=FAST_MATH, forceinline=True)
 def gather_column(rows, root, material, count, column):  # type: ignore[no-untyped-def]
     """Copy a column of the matrix, times the roots of the weights."""
     for i in range(count):

@@ -39,7 +39,7 @@ MAX_STDERR_RAD = 0.5
 """Relative standard error above which a signal is lost in its noise."""
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
     """Sum the moments for standard errors over weighted samples; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)

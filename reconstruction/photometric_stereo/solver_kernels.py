@@ -35,7 +35,7 @@ NORMAL_MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
 _N_BISECTIONS = 10
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy", inline="always")
+@njit(fastmath=FAST_MATH, error_model="numpy", inline="always")
 def _solve(a, g):  # type: ignore[no-untyped-def]
     """Solve the symmetric system a = (xx, xy, xz, yy, yz, zz), g, in float64; singular gives 0."""
     xx, xy, xz, yy, yz, zz = a
@@ -57,7 +57,7 @@ def _solve(a, g):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
     """Return the Newton step of sum m |r| with |r| smoothed below ``soft``."""
     zero = x.dtype.type(0.0)
@@ -80,7 +80,7 @@ def step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
     """Return the step to the least squares of the samples chosen by m."""
     zero = x.dtype.type(0.0)
@@ -102,7 +102,7 @@ def step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, min_shading):  # type: ignore[no-untyped-def]
     """Return the step of Tukey's biweight over the samples that the fitted normal faces."""
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
@@ -127,7 +127,7 @@ def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, min_shading):  # type: 
     return _solve(a, (float(gx), float(gy), float(gz)))
 
 
-@njit(cache=True, nogil=True, fastmath=FINITE_MATH, error_model="numpy")
+@njit(fastmath=FINITE_MATH, error_model="numpy", forceinline=True)
 def kth_largest(q, rank):  # type: ignore[no-untyped-def]
     """Return an upper approximation of the rank-th largest of the values above 0."""
     zero, one = q.dtype.type(0.0), q.dtype.type(1.0)
@@ -149,7 +149,7 @@ def kth_largest(q, rank):  # type: ignore[no-untyped-def]
     return high
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def fill_residuals(x, y, z, v, s, m, b0, b1, b2, min_shading, q):  # type: ignore[no-untyped-def]
     """Write |r| of lit samples to q, -1 for others; return their number.
 
@@ -165,7 +165,7 @@ def fill_residuals(x, y, z, v, s, m, b0, b1, b2, min_shading, q):  # type: ignor
     return int(count)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def residual_scale(q, count):  # type: ignore[no-untyped-def]
     """Return the scale of residuals: their median without the three that any fit makes 0."""
     if count < 4:
@@ -175,7 +175,7 @@ def residual_scale(q, count):  # type: ignore[no-untyped-def]
     return kth_largest(q, rank) / q.dtype.type(NORMAL_MAD) * q.dtype.type(1.0 + 5.0 / (count - 3))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy", forceinline=True)
 def fit_intensity_weighted(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
     """Return least squares with each sample weighted by the square of its intensity.
 

@@ -21,10 +21,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import metadata, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from reconstruction.pipeline.library_versions import list_library_versions
 from reconstruction.pipeline.product_file import (
     PRODUCT_PACKAGES,
     DamagedFileError,
@@ -42,7 +43,6 @@ BYTES_PER_S: Final = 2.5e8
 """Assumed rate of storing before the first file is written, with checksum."""
 FILE_S: Final = 1e-3
 """Seconds to make a file."""
-HASHED_VERSIONS: Final = ("skinrig", "numpy", "scipy", "numba")
 _LOCK_FILE: Final = "lock"
 _RUN_FILE: Final = "run"
 _SCRATCH_SUFFIX: Final = ".scratch"
@@ -54,10 +54,10 @@ class BusyError(ValueError):
 
 @cache
 def code_digest() -> str:
-    """Hash the code and data of the packages that determine a map, and the versions of others."""
+    """Hash the code and data of the packages that determine a map, and the libraries' versions."""
     digest = hashlib.sha256()
-    for name in HASHED_VERSIONS:
-        digest.update(f"{name} {metadata.version(name)}\0".encode())
+    for name, version in list_library_versions().items():
+        digest.update(f"{name} {version}\0".encode())
     for package in PRODUCT_PACKAGES:
         root = Path(str(resources.files(package)))
         for path in sorted(root.rglob("*")):
@@ -119,7 +119,7 @@ class Checkpoints:
     Attributes
     ----------
     folder
-        Work folder; made when the first file is stored.
+        Work folder; made and locked when the first stage is computed.
     identity
         Hash of everything that the run's stages depend on.
     record
@@ -196,7 +196,14 @@ class Checkpoints:
         return found
 
     def compute(self, key: str, run: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-        """Run a stage, and store its products and what it recorded."""
+        """Run a stage, and store its products and what it recorded.
+
+        Raises
+        ------
+        BusyError
+            When another process has locked the work folder.
+        """
+        self._lock_early()
         before = self.record.copy()
         self._stage = key
         made = run()
@@ -207,6 +214,7 @@ class Checkpoints:
 
     def compute_again(self, key: str, run: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
         """Run a finished stage whose products were not stored; record nothing twice."""
+        self._lock_early()
         before = self.record.copy()
         self._stage = key
         try:
@@ -238,9 +246,13 @@ class Checkpoints:
         for path in self.folder.parent.iterdir():
             if unfinished.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
-        for made in self._new_folders:
-            with suppress(OSError):  # holds the maps
+        # the lock comes last: until then, no other process takes the folder
+        for path in self.folder.iterdir():
+            if path.name != _LOCK_FILE:
+                _remove_path(path)
+        _remove_path(self.folder / _LOCK_FILE)
+        for made in (self.folder, *self._new_folders):
+            with suppress(OSError):  # contains the maps, or files of a run that waited for the lock
                 made.rmdir()
 
     def _path(self, *parts: str) -> Path:
@@ -278,20 +290,10 @@ class Checkpoints:
         """Make and lock the folder, and remove the files of other runs."""
         if self._lock is not None:
             return
-        missing = [path for path in self.folder.absolute().parents if not path.exists()]
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        self._new_folders = missing
-        self.folder.mkdir(mode=0o700, exist_ok=True)
-        lock = os.open(self.folder / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(lock)
-            raise BusyError(
-                f"{self.folder}: another skinrig process computes these maps, expected none; wait "
-                "until it ends, or name another folder"
-            ) from None
-        self._lock = lock
+        self._new_folders = [p for p in self.folder.absolute().parents if not p.exists()]
+        while self._lock is None:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            self._lock = _lock_folder(self.folder)
         run = self.folder / _RUN_FILE
         if not run.is_file() or run.read_text() != self.identity:
             for path in self.folder.iterdir():
@@ -301,10 +303,50 @@ class Checkpoints:
                     shutil.rmtree(path)
             run.write_text(self.identity)
 
+    def _lock_early(self) -> None:
+        with suppress(OSError):  # without locks or space: the maps themselves fail, or need neither
+            self._open()
+
     def _close(self) -> None:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+
+def _lock_folder(folder: Path) -> int | None:
+    """Make a folder; return its open and locked file, None if another run removed it meanwhile."""
+    path = folder / _LOCK_FILE
+    folder.mkdir(mode=0o700, exist_ok=True)
+    try:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # the run that held the lock may have removed this file after it was opened here
+        if os.path.samestat(os.fstat(lock), os.stat(path)):
+            return lock
+    except FileNotFoundError:
+        pass
+    except BlockingIOError:
+        os.close(lock)
+        raise BusyError(
+            f"{folder}: another skinrig process computes these maps, expected none; wait until it "
+            "ends, or name another folder"
+        ) from None
+    except OSError:
+        os.close(lock)
+        raise
+    os.close(lock)
+    return None
+
+
+def _remove_path(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def compute_tiles(

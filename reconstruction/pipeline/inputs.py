@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
+from model.brdf.tables import list_material_files
 from reconstruction.pipeline.checkpoints import Checkpoints, RunRecord, compute_tiles
 from reconstruction.pipeline.graph import PipelineStage, make_stage_factory
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
@@ -267,7 +268,7 @@ def _digest_of(folder: Path) -> str:
         got = f"got {folder}, expected a folder"
         raise InputsError(f"basis: {got}; give one with MERL .binary files")
     digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.binary")):
+    for path in list_material_files(folder):
         digest.update(path.name.encode() + b"\0")
         with open(path, "rb") as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())

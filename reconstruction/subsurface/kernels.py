@@ -21,7 +21,7 @@ from reconstruction.arrays import Float64Array
 N_PARAMETERS = 4
 TABLE_MODEL = 1
 """The model is a table; anything else is a closed form."""
-_FAST_MATH = {"contract", "reassoc", "nsz"}
+_FAST_MATH = {"contract", "nsz"}
 _FOUR_PI = 4.0 * math.pi
 
 

@@ -21,7 +21,7 @@ MAX_LOG_STEP = 1.5
 """Largest change of a logarithm in one step."""
 LOG_STEP_TOL = 1e-5
 """Step of the logarithms at which the fit has converged."""
-_FAST_MATH = {"contract", "reassoc", "nsz"}
+_FAST_MATH = {"contract", "nsz"}
 _MIN_REFLECTANCE = 1e-290
 
 

@@ -10,7 +10,7 @@ from capture.plan.dome import add_scan, dome_calibration_plan
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
-from reconstruction.pipeline.dome.stripes import decode_scan, has_stripes
+from reconstruction.pipeline.dome.stripes import decode_scan, has_stripes, load_scanner
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.recipes import reconstruct
 from reconstruction.scan.closest_points import ScanSurface
@@ -64,7 +64,8 @@ def distances(folder, points_mm):
 
 
 def decoded(folder, calibration):
-    return decode_scan(Inputs.of(Session.open(folder / "face"), calibration, state="neutral"))
+    inputs = Inputs.of(Session.open(folder / "face"), calibration, state="neutral")
+    return decode_scan(inputs, load_scanner(inputs))
 
 
 def test_calibrated_stripes_recover_surface(folder):

@@ -31,7 +31,12 @@ from reconstruction.pipeline.dome.lobes import (
 )
 from reconstruction.pipeline.dome.motion import DomeHeadMotion, follow_head
 from reconstruction.pipeline.dome.registration import register_mesh
-from reconstruction.pipeline.dome.stripes import decode_scan, has_stripes
+from reconstruction.pipeline.dome.stripes import (
+    ScannerPoses,
+    decode_scan,
+    has_stripes,
+    load_scanner,
+)
 from reconstruction.pipeline.hold_out import HoldOutError
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.skin_tone import maps as tone
@@ -43,7 +48,7 @@ from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 
-STAGE_REVISION = 6
+STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"
@@ -73,10 +78,13 @@ FILE_NAMES = (MESH_FILE, BASIS_FILE)
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages of a dome session; see `graph.run_stages`."""
     dome = _dome(inputs)
+    striped = inputs.scan is None and has_stripes(inputs.session)
+    scanner = load_scanner(inputs) if striped else None
     stage = inputs.stage_maker(STAGE_REVISION)
     if inputs.hold_out:
         stage = partial(stage, held_out=inputs.hold_out.record())
-    weights = " ".join(weight_names(inputs.rank or BASIS_RANK))
+    rank = inputs.rank or BASIS_RANK
+    weights = " ".join(weight_names(rank))
     unscaled = (
         "r_d: the lights are not calibrated and an albedo has no scale without them; run "
         "`skinrig calibrate lights` on sessions of the mirror spheres and the white target "
@@ -89,7 +97,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     view, light = inputs.session.rig.views[0], inputs.session.rig.lights[0]
     spectra = {"camera": view.spectral_sensitivity, "illuminant": light.illuminant}
     return [
-        stage("surface", "", "surface", partial(_surface, inputs, dome)),
+        stage("surface", "", "surface", partial(_surface, inputs, dome, scanner)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
         stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
         stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, inputs, dome)),
@@ -97,7 +105,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
         stage("normals", seen, "point_normals normals", partial(_normals, dome)),
         stage("albedo", turned, "point_r_d r_d", partial(_albedo, dome), refused),
-        stage("lobes", lit, lobes, partial(fit_lobes, inputs), ranks=list(RECORDED_RANKS)),
+        stage(
+            "lobes", lit, lobes, partial(fit_lobes, inputs), rank=rank, ranks=list(RECORDED_RANKS)
+        ),
         stage(
             "refined normals",
             f"surface {lit} {lobes} texture",
@@ -131,11 +141,10 @@ def _dome(inputs: Inputs) -> CalibratedDome:
     return load_dome(inputs, images)
 
 
-def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
+def _surface(inputs: Inputs, dome: CalibratedDome, scanner: ScannerPoses | None) -> RefinedScan:
     """Clean and refine the scan, and register it to the dome."""
     session = inputs.session
-    striped = inputs.scan is None and has_stripes(session)
-    if not striped and inputs.scan is None and SCAN_FILE not in session.attachments():
+    if scanner is None and inputs.scan is None and SCAN_FILE not in session.attachments():
         raise InputsError(
             f"session {session.id}: got no scan, expected one; add it with "
             "`skinrig import mesh FILE` [SR-REC-006]"
@@ -143,7 +152,7 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_AREA_MM2 / footprint**2, *POINT_LIMITS))
-    decoded = decode_scan(inputs) if striped else None
+    decoded = None if scanner is None else decode_scan(inputs, scanner)
     mesh: bytes | TriangleMesh
     if decoded is not None:
         mesh = decoded.mesh

@@ -40,6 +40,17 @@ class DecodedScan:
     """Whether the scanner is calibrated, and with it the mesh's place in the rig frame."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ScannerPoses:
+    """Cameras and projectors of a scanner, calibrated or nominal."""
+
+    devices: Mapping[str, CameraPose]
+    """Poses by name."""
+    depth_stderr_mm: float
+    """Standard error of depth from the calibration, mm; 0 if nominal."""
+    calibrated: bool
+
+
 def has_stripes(session: Session) -> bool:
     """Return whether a session has frames of a scanner."""
     return session.rig.scanner is not None and bool(session.frames(STRIPES_KIND))
@@ -72,25 +83,23 @@ def read_stripes(
     return found, phase.mean(axis=0)
 
 
-def decode_scan(inputs: Inputs) -> DecodedScan:
+def decode_scan(inputs: Inputs, poses: ScannerPoses) -> DecodedScan:
     """Decode the stripes of a session to one mesh.
 
     Parameters
     ----------
     inputs
-        A session with frames of a scanner (`has_stripes`), and its calibrations; without the
-        scanner's, nominal geometry is assumed.
+        A session with frames of a scanner (`has_stripes`).
+    poses
+        See `load_scanner`.
 
     Raises
     ------
     ScanMeshError
         When nothing is decoded.
     """
-    session = inputs.session
-    scanner = session.rig.scanner
-    if scanner is None:
-        raise ValueError(f"session {session.id}: got no scanner, expected one; see has_stripes")
-    devices, depth_mm, calibrated = _devices(inputs, scanner)
+    session, scanner = inputs.session, _scanner(inputs)
+    devices, depth_mm = poses.devices, poses.depth_stderr_mm
     pixel_mm = float(np.median([v.distance_mm / v.focal_px for v in scanner.views]))
     voxel_mm = max(VOXEL_PIXELS * pixel_mm, MIN_VOXEL_MM)
 
@@ -123,17 +132,34 @@ def decode_scan(inputs: Inputs) -> DecodedScan:
         "noise_mm": float(np.median(noise_mm)),
         "calibration_mm": depth_mm,
     }
-    return DecodedScan(mesh, np.hypot(noise_mm, depth_mm), record, calibrated)
+    return DecodedScan(mesh, np.hypot(noise_mm, depth_mm), record, poses.calibrated)
 
 
-def _devices(inputs: Inputs, scanner: Scanner) -> tuple[Mapping[str, CameraPose], float, bool]:
-    """Return cameras and projectors, their standard error of depth, mm, and whether calibrated."""
+def load_scanner(inputs: Inputs) -> ScannerPoses:
+    """Load the scanner's calibration; without one, assume the nominal geometry.
+
+    Call this before `Inputs.stage_maker`, so that the calibration is part of the stages' keys.
+
+    Raises
+    ------
+    CalibrationError
+        When the calibration is damaged, of another rig or device, or out of date.
+    """
+    scanner = _scanner(inputs)
     pinholes = [*scanner.views, *(projector.pinhole for projector in scanner.projectors)]
     serials = {pinhole.name: pinhole.serial for pinhole in pinholes}
     nominal = "the scanner has the nominal geometry of the rig file"
     found = inputs.load("scanner", list(serials.values()), nominal)
     if found is None:
-        return {pinhole.name: CameraPose.nominal(pinhole) for pinhole in pinholes}, 0.0, False
+        poses = {pinhole.name: CameraPose.nominal(pinhole) for pinhole in pinholes}
+        return ScannerPoses(poses, 0.0, False)
     depths = [float(found.quantity(view.serial, "depth_stderr_mm").value) for view in scanner.views]
     depth_mm = float(np.sqrt(np.mean(np.square(depths))))
-    return poses_from_calibration(found, serials), depth_mm, True
+    return ScannerPoses(poses_from_calibration(found, serials), depth_mm, True)
+
+
+def _scanner(inputs: Inputs) -> Scanner:
+    session = inputs.session
+    if session.rig.scanner is None:
+        raise ValueError(f"session {session.id}: got no scanner, expected one; see has_stripes")
+    return session.rig.scanner

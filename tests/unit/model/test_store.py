@@ -151,6 +151,12 @@ def test_a_map_that_the_disk_refuses_is_named(tmp_path):
         store.write_exr(tmp_path / "nothing" / "a.exr", pixels)
 
 
+@pytest.mark.parametrize("folder", [".", "..", "a/..", "/"])
+def test_folder_without_name_is_refused_beforehand(folder):
+    with pytest.raises(store.StoreError, match="give its full path"):
+        store.require_free(folder)
+
+
 def test_irreplaceable_folder_is_refused_beforehand(tmp_path):
     store.require_free(tmp_path / "new" / "deep")
     (tmp_path / "notes.txt").write_text("mine")

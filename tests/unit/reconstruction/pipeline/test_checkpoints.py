@@ -196,3 +196,48 @@ def test_foreign_files_of_work_folder_are_kept(tmp_path):
     assert note.read_text() == "keep"
     assert len(list(note.parent.glob("*.npz"))) == N_TILES + 3
     shutil.rmtree(note.parent)
+
+
+def test_second_run_is_refused_before_first_store(tmp_path):
+    class Second(Run):
+        def frames(self):
+            with pytest.raises(BusyError, match="another skinrig process"):
+                Run(self.out).run()
+            return super().frames()
+
+    expected = Run(tmp_path / "whole").run()
+    assert Second(tmp_path / "out").run() == expected
+
+
+def test_lock_removed_while_opened_is_replaced(tmp_path, monkeypatch):
+    """A process that opened the lock of a finishing run must not lock the removed file."""
+    first = Checkpoints(tmp_path / "work", "", RunRecord([], {}, {}))
+    first._open()
+    opened, opens = [], module.os.open
+
+    def open_late(*arguments):
+        opened.append(opens(*arguments))
+        if len(opened) == 1:
+            first.remove()
+            first._close()
+        return opened[-1]
+
+    monkeypatch.setattr(module.os, "open", open_late)
+    second = Checkpoints(tmp_path / "work", "", RunRecord([], {}, {}))
+    second._open()
+    third = Checkpoints(tmp_path / "work", "", RunRecord([], {}, {}))
+    with pytest.raises(BusyError):
+        third._open()
+    second.remove()
+    second._close()
+    assert len(opened) == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_code_digest_changes_with_library_version(monkeypatch):
+    monkeypatch.setattr(module, "PRODUCT_PACKAGES", ())
+    found = set()
+    for version in ("1", "2"):
+        monkeypatch.setattr(module, "list_library_versions", lambda: {"trimesh": version})  # noqa: B023
+        found.add(module.code_digest.__wrapped__())
+    assert len(found) == 2

@@ -1,4 +1,4 @@
-"""Gaps in a calibration of the dome's lights are reported, and never used as values."""
+"""Calibrations of the dome: gaps are reported, and all that a stage uses is part of its key."""
 
 from datetime import UTC, date, datetime
 
@@ -12,7 +12,9 @@ from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, SubjectRecord
 from reconstruction.pipeline.dome import stages as dome_stages
-from reconstruction.pipeline.inputs import Inputs
+from reconstruction.pipeline.dome import stripes
+from reconstruction.pipeline.graph import input_hashes, order_stages
+from reconstruction.pipeline.inputs import DomeOptions, Inputs
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
 TODAY = date(2026, 11, 21)
@@ -20,7 +22,11 @@ TODAY = date(2026, 11, 21)
 
 @pytest.fixture
 def session(tmp_path):
-    view = RIG.views[0]
+    return capture_session(tmp_path, RIG)
+
+
+def capture_session(tmp_path, rig):
+    view = rig.views[0]
     steps = tuple(
         Step(
             f"O{light.name}",
@@ -34,7 +40,7 @@ def session(tmp_path):
     with Session.create(
         tmp_path / "session",
         plan=Plan("dome", steps),
-        rig=RIG,
+        rig=rig,
         devices={},
         subject=SubjectRecord("P1", ("research",)),
         source="simulated",
@@ -87,3 +93,54 @@ def test_whole_calibrations_leave_only_the_cameras_to_assume(session, tmp_path):
     evidence = evidence_with(session, tmp_path / "c", {})
     assert not albedo_of(evidence)
     assert evidence.assumed == ["the cameras have the nominal poses of the rig file"]
+
+
+def test_stage_keys_depend_on_scanner_calibration(tmp_path, monkeypatch):
+    rig = RIG.with_scanner()
+    session = capture_session(tmp_path, rig)
+    monkeypatch.setattr(dome_stages, "has_stripes", lambda session: True)
+    monkeypatch.setattr(stripes, "poses_from_calibration", lambda *_: {})
+    scanner = rig.scanner
+    serials = [view.serial for view in scanner.views]
+    serials += [projector.pinhole.serial for projector in scanner.projectors]
+
+    def surface_key(depth_stderr_mm):
+        if depth_stderr_mm:
+            values = {s: {"depth_stderr_mm": store.Quantity(depth_stderr_mm)} for s in serials}
+            made = store.Calibration(
+                *("scanner", "dome", tuple(serials), TODAY, TODAY, "simulated", values)
+            )
+            store.save(made, tmp_path / "c")
+        inputs = evidence_with(session, tmp_path / "c", {})
+        graph = dome_stages.graph(inputs)
+        keys = input_hashes(order_stages(graph, ["normals"]))
+        # recorded before any stage runs, thus also when the stage is reused
+        assert ("calibration scanner" in inputs.hashes) == bool(depth_stderr_mm)
+        nominal = "the scanner has the nominal geometry of the rig file"
+        assert (nominal in inputs.assumed) == (not depth_stderr_mm)
+        return keys["surface"]
+
+    keys = [surface_key(depth) for depth in (0.0, 0.1, 0.1, 0.2)]
+    assert keys[1] == keys[2]
+    assert len(set(keys)) == 3
+
+
+def test_lobes_key_depends_on_rank(session):
+    def key(rank):
+        options = DomeOptions(rank=rank)
+        graph = dome_stages.graph(
+            Inputs.of(session, None, state="neutral", on_date=TODAY, dome=options)
+        )
+        return input_hashes(order_stages(graph, ["basis"]))["lobes"]
+
+    assert key(None) == key(4) != key(5)
+
+
+def test_basis_hash_covers_upper_case_tables(session, tmp_path):
+    def digest(content):
+        (tmp_path / "tables").mkdir(exist_ok=True)
+        (tmp_path / "tables" / "SKIN.BINARY").write_bytes(content)
+        options = DomeOptions(basis=tmp_path / "tables")
+        return Inputs.of(session, None, state="neutral", dome=options).hashes["basis"]
+
+    assert digest(b"1") != digest(b"2")
