@@ -24,9 +24,8 @@ import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -40,6 +39,7 @@ from capture.documents import (
     read_toml,
 )
 from capture.plan.rig_kinds import RIG_KINDS
+from reconstruction.pipeline.library_versions import list_library_versions
 from rigsim.population import files as subject_file
 from rigsim.population.subject_melanin import subject_melanin
 from rigsim.subject import pigment
@@ -349,7 +349,7 @@ def _hash_files(paths: list[Path]) -> str:
 
 @functools.cache
 def software_hash() -> str:
-    """Return the hash of skinrig's sources and data and of the numerical libraries' versions.
+    """Return the hash of skinrig's sources and data and of its libraries' versions.
 
     A result of other software is never taken for one of this.
     """
@@ -357,10 +357,7 @@ def software_hash() -> str:
     for package in HASHED_PACKAGES:
         files = (PACKAGES_FOLDER / package).rglob("*")
         paths += sorted(p for p in files if p.is_file() and "__pycache__" not in p.parts)
-    libraries: dict[str, Any] = {
-        name: metadata.version(name) for name in ("numpy", "scipy", "numba", "mitsuba")
-    }
-    content = canonical_json([_hash_files(paths), libraries])
+    content = canonical_json([_hash_files(paths), list_library_versions()])
     return hashlib.sha256(content).hexdigest()[:20]
 
 
