@@ -228,7 +228,7 @@ def build_scene(
     progress("fine skin")
     skin = FineSkin(subject, size)
     of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
-    source = SceneSource(kind, *of, landmarks, calibration)
+    source = SceneSource(kind, *of, landmarks, calibration, own_mesh=whole is not None)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
         provenance |= {} if mesh is None else {"mesh": mesh.name}

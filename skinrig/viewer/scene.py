@@ -120,6 +120,8 @@ class SceneSource:
         Table of landmarks of the flash rig's neutral image.
     calibration
         Folder with the color calibration of the dome's cameras.
+    own_mesh
+        Whether the mesh is a scan or a file, not the simulated head.
     """
 
     kind: Kind
@@ -132,6 +134,7 @@ class SceneSource:
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None
     calibration: Path | None = None
+    own_mesh: bool = False
 
     @property
     def fitted(self) -> tuple[SkinAppearance, ...]:

@@ -36,10 +36,10 @@ _AZIMUTHAL_ROUGHNESS: Final = 0.3
 def build_assets(source: SceneSource) -> Assets:
     """Build eyes behind lids that open, brows, lashes and hair of a simulated head.
 
-    Meshes other than the simulated head keep their own geometry and have none.
+    A scan and the mesh of a file keep their own geometry and have none.
     """
     rest = source.subject if source.subject.rest is None else source.subject.rest
-    if source.kind == "mesh" or eyelids.grid_shape(source.mesh) is None:
+    if source.own_mesh or eyelids.grid_shape(source.mesh) is None:
         return Assets(left_out=(("eyes and hair", "only the simulated head has them"),))
     hair = draw_hair(source.mesh, rest.preset, seed=source.seed)
     tables: dict[str, NDArray[Any]] = {}
