@@ -61,8 +61,8 @@ def state(angle_deg, step, r):
     axis = np.array([math.cos(turn), math.sin(turn)])
     gradient = np.eye(2) + (r - 1) * np.outer(axis, axis)
     described = SkinState(state_name(angle_deg, step), angle_deg, step, 8 * r, 0.1)
-    told = Strain(gradient, np.zeros(2), 1e-8 * np.eye(6), 0.05, 100, True)
-    return StateStrain(described, r, told)
+    strain = Strain(gradient, np.zeros(2), 1e-8 * np.eye(6), 0.05, 100, True)
+    return StateStrain(described, r, strain)
 
 
 def as_map(height):
@@ -86,17 +86,17 @@ def fitted(relief):
         strains.append(state(angle, step, r))
         heights[strains[-1].state.name] = as_map(middle(strained(relief, angle, r, alpha, sigma)))
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
-    told = []
+    fractions = []
 
     def compute_tiles(name, tiles, compute):
         for number, tile in enumerate(tiles):
-            told.append(number / len(tiles))
+            fractions.append(number / len(tiles))
             yield compute(tile)
 
     document = fit_kernels(
         strains, heights, counted, pixel_um=PIXEL_UM, compute_tiles=compute_tiles
     )
-    return strains, counted, document, told
+    return strains, counted, document, fractions
 
 
 def test_known_kernels_are_recovered_at_both_angles(fitted):
@@ -230,8 +230,8 @@ def test_state_is_counted_in_blocks_that_show_skin(relief, angle_deg):
 
 
 def test_progress_is_reported_and_direction_is_irrelevant(fitted):
-    _, _, document, told = fitted
-    assert told == [0.0, 0.25, 0.5, 0.75]
+    _, _, document, fractions = fitted
+    assert fractions == [0.0, 0.25, 0.5, 0.75]
     if document["direction"] is not None:
         assert document["direction"]["p_alpha"] > 1e-3
 
