@@ -155,10 +155,10 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         maps = command.startswith("skinrig reconstruct")
         why = "maps with standard uncertainties" if maps else "the calibration that its maps need"
         steps.append(Step(command, why))
-    viewable = {p: d for p, d in found.appearances.items() if _is_viewable(d)}
+    viewable = {p: d for p, d in found.appearances.items() if _is_viewable(p, d)}
     if viewable:
         seen = shell_quote(_most_complete(viewable, ("facial_color.json", "mesh.obj")))
-        steps.append(Step(f"skinrig view {seen}", "an interactive page of the face, with lights"))
+        steps.append(Step(f"skinrig view {seen}", "an interactive page of these maps, with lights"))
     permitted = {p: d for p, d in found.appearances.items() if _permits_research(d)}
     if permitted:
         given = _most_complete(permitted, ("mesh.obj",))
@@ -243,13 +243,20 @@ def _state_option(session: Mapping[str, Any]) -> str:
     return "" if not states or "neutral" in states else f" --state {shell_quote(states[0])}"
 
 
-def _is_viewable(appearance: Mapping[str, Any]) -> bool:
-    """Return whether `skinrig view` shows an appearance: a moving face, a model, or a dome's."""
+def _is_viewable(path: Path, appearance: Mapping[str, Any]) -> bool:
+    """Return whether `skinrig view` shows an appearance without further options."""
     parameters, files = appearance.get("parameters", {}), appearance.get("files", {})
-    if "mesh.obj" in files and "r_d" in appearance.get("maps", {}):
+    maps = appearance.get("maps", {})
+    if "mesh.obj" in files and "r_d" in maps:
         return True
-    is_model = "brdf_basis.npz" in files and "reflectance_model" in parameters
-    return is_model or ("fusion" not in parameters and bool(parameters.get("parts")))
+    if "brdf_basis.npz" in files and "reflectance_model" in parameters:
+        return True
+    if "fusion" not in parameters and parameters.get("parts"):
+        return True
+    if {"melanin", "hemoglobin"} <= maps.keys():  # landmarks map them to the head
+        truth = str(parameters.get("truth") or "")
+        return bool(truth) and (path.parent / truth / "appearance.json").is_file()
+    return any(name.split("_")[0] in ("normals", "translucency") for name in maps)
 
 
 def _permits_research(appearance: Mapping[str, Any]) -> bool:

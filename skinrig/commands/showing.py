@@ -19,8 +19,6 @@ from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import EXIT_LIMIT_MISSED, UnusableError, UsageError
 
 MAX_PORT = 65_535
-FACE_PX, PEOPLE_PX = 2048, 1024
-"""Width of the textures of one face and of several, texels; pages of up to three have 5 MB."""
 
 
 @command
@@ -169,7 +167,8 @@ class HeadOptions:
     seed
         Random seed of the simulated head.
     size_px
-        Width and height of textures, texels, 64 to 4096; default 2048, with people 1024.
+        Width and height of textures, texels, 64 to 4096; default 2048, with people or of a picture
+        1024.
     people
         Skin types of several simulated people on one head, separated by commas: II,IV,VI.
     """
@@ -192,7 +191,7 @@ def view(
     head: HeadOptions,
     json: Json = False,
 ) -> None:
-    """Write a self-contained interactive page of a face: expressions, blood, light, traits.
+    """Write a self-contained interactive page of a face, or of an image with normals.
 
     Example: skinrig view -o page.html
 
@@ -200,12 +199,15 @@ def view(
 
     Example: skinrig view demo/appearance-dome-III --size-px 1024 --port 0
 
+    Example: skinrig view demo/appearance-gradient-forehead -o forehead.html
+
     Example: skinrig view --people II,IV,VI -o people.html
 
     Parameters
     ----------
     appearance
-        Folders of one face, by `skinrig fit`, or maps of a dome session; none: a simulated head.
+        Folders of maps of one face, by `skinrig reconstruct` or `fit`, or one with normals in an
+        image; none: a simulated head.
     port
         Serve the page on this local port instead of writing a file; 0: any free port.
     displacement
@@ -223,9 +225,8 @@ def view(
     people = tuple(parse_names(head.people) or ())
     if people and head.preset is not None:
         raise UnusableError(f"--preset: got {head.preset} with --people; name each type there")
-    side = (PEOPLE_PX if people else FACE_PX) if head.size_px is None else head.size_px
     given = select_attributes(face, "mesh", "landmarks", "calibration")
-    given |= {"seed": head.seed, "size": side, "people": people}
+    given |= {"seed": head.seed, "size": head.size_px, "people": people}
     given |= {} if head.preset is None else {"preset": head.preset}
     console.progress("making textures and tables")
     scene = faces.build_scene(appearance or [], **given, progress=console.progress)
@@ -233,9 +234,10 @@ def view(
     document: dict[str, Any]
     if port is None:
         document = page.write(scene, out)
+        shapes = "" if scene.page == "picture" else f", {document['blend_shapes']} blend shapes"
         console.print_line(
-            f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
-            f"{document['blend_shapes']} blend shapes; open it in a browser"
+            f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures"
+            f"{shapes}; open it in a browser"
         )
     console.print_omissions(scene.left_out)
     if port is None:

@@ -27,6 +27,7 @@ from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
 from skinrig.viewer.microstructure import assets as microstructure_assets
+from skinrig.viewer.pictures import PICTURE_PX, build_picture_scene, find_states
 from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, SceneSource, ViewerScene
 
 Weights = Mapping[str, float]
@@ -141,8 +142,13 @@ MAX_PEOPLE = 6
 """Largest number of people of one page, for the size of the page."""
 MESH_FILE: Final = "mesh.obj"
 ALBEDO_MAP: Final = "r_d"
-CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic")
+TRANSLUCENCY_MAP: Final = "translucency"
+CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic", "flash", "probe")
 """Kinds of folders in order of preference for the geometry."""
+PICTURE_KIND: Final = "picture"
+"""Kind of a folder whose normals lie in a camera's image."""
+FACE_PX, PEOPLE_PX = 2048, 1024
+"""Default side of the textures of one face and of several, texels; pages of three have 5 MB."""
 MIN_TEXTURE_PX = 64
 POSITION_STEPS_PER_MM = np.float32(1024.0)
 """Quantization of positions; strain is computed from the rounded mesh."""
@@ -156,16 +162,17 @@ def build_scene(
     calibration: Path | None = None,
     preset: str = DEFAULT_PRESET,
     seed: int = 0,
-    size: int = 2048,
+    size: int | None = None,
     people: Sequence[str] = (),
     progress: Callable[[str], None] = _ignore,
 ) -> ViewerScene:
-    """Build the scene of fitted folders, or of a simulated person without any.
+    """Build the scene of folders of maps, or of a simulated person without any.
 
     Parameters
     ----------
     paths
-        Folders of `skinrig reconstruct` (dome) or `skinrig fit`, one per kind.
+        Folders of `skinrig reconstruct` or `skinrig fit`, one per kind; or one folder with
+        `normals` in a camera's image, which is shown as a picture under a light.
     mesh
         Mesh of the face, or to be covered with simulated skin, see `load_mesh`; None: the mesh of
         a folder, else the procedural head.
@@ -179,7 +186,8 @@ def build_scene(
         Simulated person, one of `rigsim.subject.PRESET_NAMES`, and its seed; folders have their
         own seed.
     size
-        Side of the large textures, 64 to 4096 texels.
+        Side of the large textures, 64 to 4096 texels; None: `FACE_PX`, of several people
+        `PEOPLE_PX`, of a picture `skinrig.viewer.pictures.PICTURE_PX`.
     people
         Skin types of several simulated people in place of ``preset``, on the same head.
     progress
@@ -197,7 +205,7 @@ def build_scene(
     rigsim.geometry.mesh.MeshError
         If preset, seed or mesh are invalid.
     """
-    if not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
+    if size is not None and not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
         raise SceneError(
             f"--size-px: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX}; enter another"
         )
@@ -217,6 +225,18 @@ def build_scene(
         raise SceneError(f"--people: got {len(people)} types, expected at most {MAX_PEOPLE}")
     preset = people[0] if people else preset
     folders, appearances = _read(paths)
+    if PICTURE_KIND in folders:
+        if len(paths) > 1 or (mesh, landmarks, calibration) != (None, None, None):
+            raise SceneError(
+                f"{folders[PICTURE_KIND]}: a picture has its own page; show it without "
+                "other folders, --mesh, --landmarks and --calibration"
+            )
+        side = PICTURE_PX if size is None else size
+        return build_picture_scene(
+            folders[PICTURE_KIND], appearances[PICTURE_KIND], size=side, progress=progress
+        )
+    if size is None:
+        size = PEOPLE_PX if people else FACE_PX
     whole, mesh_origin = _mesh(appearances, mesh)
     kind: Kind = "procedural" if mesh is None else "mesh"
     if paths:
@@ -277,6 +297,21 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
             if kind in folders:
                 raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
             appearances[kind], folders[kind] = appearance, path
+    colored = [
+        path
+        for kind, path in folders.items()
+        if kind in ("dome", "model")
+        or (
+            kind == "dynamic"
+            and dynamic_appearance.FACIAL_COLOR
+            in dynamic_appearance.describe_parts(appearances[kind])
+        )
+    ]
+    if "flash" in folders and colored:
+        raise SceneError(
+            f"{folders['flash']}: got chromophores and {colored[0]}, which has the color of the "
+            "face; show one of both, or `skinrig fuse` the maps of all rigs"
+        )
     return folders, appearances
 
 
@@ -333,7 +368,7 @@ def build_viewer_mesh(subject: SimulatedSubject) -> Mesh:
 
 
 def detect_kind(path: Path, appearance: SkinAppearance) -> str:
-    """Return "dynamic", "dome" or "model".
+    """Return "dynamic", "dome", "model", "flash", "probe" or "picture".
 
     Raises
     ------
@@ -348,10 +383,17 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
         return "model"
     if MESH_FILE in appearance.files and ALBEDO_MAP in appearance.maps:
         return "dome"
+    if appearance.maps.keys() >= set(facial_color_assets.CHROMOPHORE_MAPS):
+        return "flash"
+    if TRANSLUCENCY_MAP in appearance.maps:
+        return "probe"
+    if find_states(appearance):
+        return PICTURE_KIND
     raise SceneError(
         f"{path}: got {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
-        "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), or a dome's maps with "
-        f"{ALBEDO_MAP} and {MESH_FILE}"
+        "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), a dome's maps with "
+        f"{ALBEDO_MAP} and {MESH_FILE}, melanin and hemoglobin of a flash session, "
+        f"{TRANSLUCENCY_MAP} of a probe's, or normals of an image"
     )
 
 

@@ -175,6 +175,7 @@ def pack(scene: ViewerScene) -> PackedScene:
             "data": data,
         }
     header |= {
+        "page": scene.page,
         "params": scene.params,
         "presets": scene.presets,
         "facts": scene.facts,

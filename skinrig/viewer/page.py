@@ -2,8 +2,8 @@
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,20 +12,33 @@ import numpy as np
 from skinrig.atomic_file import write_atomically
 from skinrig.drawing import templates
 from skinrig.viewer.packing import PackedScene, pack
-from skinrig.viewer.scene import SceneError, ViewerScene
+from skinrig.viewer.scene import Page, SceneError, ViewerScene
 
-SCRIPT_NAMES: Final = (
-    "graph gl load mesh camera color lights shading shadow crowd eyes hair strain wrinkles detail "
-    "microstructure tiles scattering reflectance display costs probes drag address panel timeline "
-    "compare controls main"
-).split()
-"""Scripts in the order in which they run, all in one function; `main.js` comes last."""
+SCRIPT_NAMES: Final[Mapping[Page, Sequence[str]]] = {
+    "head": (
+        "graph gl load mesh camera color lights shading shadow crowd eyes hair strain wrinkles "
+        "detail microstructure tiles scattering reflectance display costs probes drag address "
+        "panel timeline compare controls main"
+    ).split(),
+    "picture": (
+        "graph gl load camera display costs probes drag address panel compare controls picture main"
+    ).split(),
+}
+"""Scripts of each page in the order in which they run, all in one function; `main.js` is last."""
+GLSL_NAMES: Final[Mapping[Page, Sequence[str]]] = {
+    "head": (
+        "color display eye geometry hair microstructure reflectance scattering shading shadow "
+        "strain wrinkles"
+    ).split(),
+    "picture": "display geometry picture".split(),
+}
+"""Files of GLSL of each page."""
 
 _CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
-def read_chunks() -> dict[str, str]:
-    """Read the chunks of GLSL, keyed by name.
+def read_chunks(of_page: Page = "head") -> dict[str, str]:
+    """Read a page's chunks of GLSL, keyed by name.
 
     Raises
     ------
@@ -33,7 +46,8 @@ def read_chunks() -> dict[str, str]:
         If two chunks have one name.
     """
     found: dict[str, str] = {}
-    for entry in sorted(_files("glsl", ".glsl"), key=lambda one: one.name):
+    here = resources.files("skinrig.viewer").joinpath("glsl")
+    for entry in (here.joinpath(f"{name}.glsl") for name in GLSL_NAMES[of_page]):
         parts = _CHUNK_LINE.split(entry.read_text(encoding="utf-8"))
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
@@ -42,13 +56,14 @@ def read_chunks() -> dict[str, str]:
     return found
 
 
-def build_script() -> str:
-    """Join all scripts to one strict function with a shared object ``V``."""
+def build_script(of_page: Page = "head") -> str:
+    """Join a page's scripts to one strict function with a shared object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
     body = "\n".join(
-        _bare(here.joinpath(f"{name}.js").read_text(encoding="utf-8")) for name in SCRIPT_NAMES
+        _bare(here.joinpath(f"{name}.js").read_text(encoding="utf-8"))
+        for name in SCRIPT_NAMES[of_page]
     )
-    glsl = json.dumps(read_chunks(), sort_keys=True)
+    glsl = json.dumps(read_chunks(of_page), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 
 
@@ -74,7 +89,7 @@ def render(packed: PackedScene, *, connect: bool = False) -> str:
     """Render the page of a packed scene."""
     here = resources.files("skinrig.viewer")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
-    code = build_script().replace("</", "<\\/")
+    code = build_script(packed.header["page"]).replace("</", "<\\/")
     source = "'self'" if connect else "'none'"
     policy = (
         f"default-src 'none'; script-src '{templates.hash_inline(code)}'; "
@@ -125,11 +140,6 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
 def _bare(text: str) -> str:
     """Strip comment lines and indentation from a script."""
     return re.sub(r"^[ \t]+", "", re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M), flags=re.M)
-
-
-def _files(folder: str, ending: str) -> list[Traversable]:
-    here = resources.files("skinrig.viewer").joinpath(folder)
-    return [entry for entry in here.iterdir() if entry.name.endswith(ending)]
 
 
 UNSAFE_CODES: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)

@@ -22,8 +22,10 @@ from skinrig.arrays import Float32Array
 from skinrig.viewer.fine_skin import FineSkin
 
 Storage = Literal["u8", "u16", "f16", "f32"]
+Page = Literal["head", "picture"]
+"""A head with blend shapes, or an image with normals."""
 Filter = Literal["linear", "mipmap", "nearest"]
-Kind = Literal["procedural", "mesh", "dynamic", "dome", "model"]
+Kind = Literal["procedural", "mesh", "probe", "flash", "dynamic", "dome", "model"]
 
 MAX_TEXTURE_PX: Final = 4096
 """Maximum side of a texture on any WebGL2 device of the last ten years."""
@@ -113,7 +115,8 @@ class SceneSource:
     skin
         Finest maps of that person, of side `size`.
     appearances
-        Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
+        Folders by kind: "probe" (translucency), "flash" (chromophores in an image), "dynamic"
+        (facial color, wrinkles, microstructure), "dome", "model".
     paths
         Paths of these folders.
     landmarks
@@ -135,6 +138,11 @@ class SceneSource:
     landmarks: Path | None = None
     calibration: Path | None = None
     own_mesh: bool = False
+
+    @property
+    def captured(self) -> bool:
+        """Whether something of the face was captured."""
+        return bool(self.appearances)
 
     @property
     def fitted(self) -> tuple[SkinAppearance, ...]:
@@ -163,6 +171,8 @@ class ViewerScene:
         Provenance of the scene.
     left_out
         Omitted features with reasons.
+    page
+        Page that shows the scene.
     """
 
     mesh: Mesh
@@ -173,6 +183,7 @@ class ViewerScene:
     facts: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     left_out: tuple[tuple[str, str], ...] = ()
+    page: Page = "head"
 
     def with_assets(self, assets: Assets) -> ViewerScene:
         """Return the scene with added assets.

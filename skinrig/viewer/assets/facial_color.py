@@ -21,7 +21,12 @@ from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import hash_file as sha256_of
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import Float64Array
-from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, place_facial_color
+from skinrig.viewer.assets.placed_color import (
+    RIG_PX,
+    FaceColor,
+    place_chromophores,
+    place_facial_color,
+)
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import downsample, fill_holes
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -202,6 +207,8 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     found = simulate_chromophores(
         subject, FineSkin(subject, subject.size) if measured else source.skin
     )
+    if "flash" in source.appearances:
+        return _placed_chromophores(source, found)
     fused = _measured_chromophores(source)
     if fused is None:
         return found
@@ -219,15 +226,29 @@ def _measured_chromophores(source: SceneSource) -> tuple[SkinMap, SkinMap] | Non
     return None
 
 
-def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
-    """Simulate the chromophores of a person, with a rig of all expressions."""
-    rig = HemoglobinRig.from_maps(
+def _placed_chromophores(source: SceneSource, simulated: FaceColor) -> FaceColor:
+    """Return the flash rig's chromophores on the texture, with the simulated rig for its blood."""
+    placed, subject = place_chromophores(source, simulated), source.subject
+    rig = _simulate_rig(subject).transfer_to(
+        downsample(placed.hemoglobin, subject.size), valid=subject.atlas.covered
+    )
+    return replace(placed, states=_stored_states(rig))
+
+
+def _simulate_rig(person: SimulatedSubject) -> HemoglobinRig:
+    """Simulate a person's hemoglobin rig of all expressions."""
+    return HemoglobinRig.from_maps(
         person.hemoglobin(),
         {name: person.hemoglobin(name) for name in STATE_NAMES if name != NEUTRAL},
         radius_px=RADIUS_PER_SIZE * person.size,
         valid=person.atlas.covered,
         stored_size=min(RIG_PX, person.size),
     )
+
+
+def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
+    """Simulate the chromophores of a person, with a rig of all expressions."""
+    rig = _simulate_rig(person)
     return FaceColor(
         melanin=skin.melanin(),
         hemoglobin=skin.hemoglobin(),

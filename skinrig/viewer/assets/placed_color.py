@@ -1,7 +1,7 @@
-"""Map the flash rig's facial color from its image to the texture of a mesh."""
+"""Map the flash rig's chromophores and facial color from its image to the texture of a mesh."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,15 +12,16 @@ from model.facial_color.coarse_maps import coarse_grid
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
 from reconstruction.correspondence import landmark_table
-from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.atlas import Atlas, unwrap
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
-from skinrig.appearances.texel_placement import PlacementError, place_texels
+from skinrig.appearances.texel_placement import PlacementError, TexelPlacement, place_texels
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import fill_holes
-from skinrig.viewer.scene import SceneError, SceneSource
+from skinrig.viewer.scene import Kind, SceneError, SceneSource
 
 MELANIN_MAP = "melanin"
+HEMOGLOBIN_MAP: Final = "hemoglobin"
 RIG_PX: Final = 256
 """Side of the scale and bias maps, cells (Jimenez 2010, section 6)."""
 
@@ -66,26 +67,11 @@ def place_facial_color(source: SceneSource) -> FaceColor:
     """
     appearance, subject = source.appearances["dynamic"], source.subject
     rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
-    marks = read_image_landmarks(source, describe_parts(appearance)[FACIAL_COLOR])
-    surface = subject.surface_landmarks()
-    points = {
-        name: (float(p[0]), float(p[1]), float(p[2]))
-        for name, p in zip(surface.names, surface.positions_on(subject.mesh), strict=True)
-    }
-    size = min(source.size, 1 << (2 * max(rig.neutral.shape) - 1).bit_length())
-    atlas = unwrap(subject.mesh, size)
-    try:
-        where = place_texels(
-            atlas.position_mm, atlas.normal, atlas.covered, landmarks_mm=points, landmarks_px=marks
-        )
-    except PlacementError as error:
-        raise SceneError(str(error)) from error
+    truth = describe_parts(appearance)[FACIAL_COLOR].get("truth") or {}
+    where, atlas = _place(source, "dynamic", truth.get("neutral"), rig.neutral.shape)
+    size = atlas.covered.shape[0]
     neutral, known = where.sample(rig.neutral, rig.valid)
-    aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
-    left_out = {
-        "color outside the image": f"{100 * aside:.0f} % of the skin was not visible; "
-        "its color is extrapolated"
-    }
+    left_out = _describe_unseen(atlas, known)
     if MELANIN_MAP in appearance.maps:
         found = appearance.maps[MELANIN_MAP]
         valid = rig.valid if found.valid is None else found.valid
@@ -111,19 +97,100 @@ def place_facial_color(source: SceneSource) -> FaceColor:
         hemoglobin=fill_holes(neutral, known),
         states=states,
         global_states=rig.global_states,
-        facts={
-            "source": appearance.source,
-            "placed_by_landmarks": where.landmarks,
-            "leave_one_out_px": where.leave_one_out_px,
-        },
+        facts=_describe_placement(source, "dynamic", where),
         left_out=tuple(left_out.items()),
     )
 
 
+def place_chromophores(source: SceneSource, simulated: FaceColor) -> FaceColor:
+    """Map the chromophores of a neutral face, without a rig, to the texture of the scene's mesh.
+
+    Parameters
+    ----------
+    source
+        Source with the flash rig's maps, kind "flash".
+    simulated
+        Color of a simulated face: its rig, and what the maps lack.
+
+    Raises
+    ------
+    SceneError
+        If landmarks of the image are missing or unusable.
+    """
+    maps = source.appearances["flash"].maps
+    name = source.appearances["flash"].parameters.get("truth")
+    where, atlas = _place(source, "flash", name, maps[MELANIN_MAP].values.shape)
+    melanin, known = where.sample(maps[MELANIN_MAP].values, maps[MELANIN_MAP].mask)
+    left_out = _describe_unseen(atlas, known)
+    hemoglobin, left = simulated.hemoglobin, "color does not determine it; it is simulated"
+    if maps[HEMOGLOBIN_MAP].mask.any():
+        blood, seen = where.sample(maps[HEMOGLOBIN_MAP].values, maps[HEMOGLOBIN_MAP].mask)
+        hemoglobin = fill_holes(blood, seen)
+        left_out["blood of expressions"] = "captured at rest; expressions scale it as simulated"
+    else:
+        left_out["blood of this face"] = left
+    return replace(
+        simulated,
+        melanin=fill_holes(melanin, known),
+        hemoglobin=hemoglobin,
+        facts=_describe_placement(source, "flash", where),
+        left_out=tuple(left_out.items()),
+    )
+
+
+def _place(
+    source: SceneSource, kind: Kind, truth: object, shape: tuple[int, ...]
+) -> tuple[TexelPlacement, Atlas]:
+    """Place the texels of the scene's mesh in an image of `shape` by landmarks of both."""
+    subject = source.subject
+    marks = read_image_landmarks(source, kind, truth)
+    surface = subject.surface_landmarks()
+    points = {
+        name: (float(p[0]), float(p[1]), float(p[2]))
+        for name, p in zip(surface.names, surface.positions_on(subject.mesh), strict=True)
+    }
+    size = min(source.size, 1 << (2 * max(shape) - 1).bit_length())
+    atlas = unwrap(subject.mesh, size)
+    try:
+        where = place_texels(
+            atlas.position_mm, atlas.normal, atlas.covered, landmarks_mm=points, landmarks_px=marks
+        )
+    except PlacementError as error:
+        raise SceneError(str(error)) from error
+    return where, atlas
+
+
+def _describe_unseen(atlas: Atlas, known: BoolArray) -> dict[str, str]:
+    """Return the omission of skin that the image does not show."""
+    aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
+    return {
+        "color outside the image": f"{100 * aside:.0f} % of the skin was not visible; "
+        "its color is extrapolated"
+    }
+
+
+def _describe_placement(source: SceneSource, kind: Kind, where: TexelPlacement) -> dict[str, Any]:
+    """Return the record of a mapping, JSON values."""
+    return {
+        "source": source.appearances[kind].source,
+        "placed_by_landmarks": where.landmarks,
+        "leave_one_out_px": where.leave_one_out_px,
+    }
+
+
 def read_image_landmarks(
-    source: SceneSource, part: dict[str, Any]
+    source: SceneSource, kind: Kind, truth: object
 ) -> dict[str, tuple[float, float]]:
     """Read the landmarks of the flash rig's neutral image, px.
+
+    Parameters
+    ----------
+    source
+        Source with maps of that image.
+    kind
+        Their kind, "dynamic" or "flash".
+    truth
+        Name of the ground truth next to their folder; no text: there is none.
 
     Raises
     ------
@@ -132,14 +199,13 @@ def read_image_landmarks(
     """
     if source.landmarks is not None:
         return landmark_table.read_landmark_table(source.landmarks)
-    name = (part.get("truth") or {}).get("neutral")
-    if isinstance(name, str):
-        folder = source.paths["dynamic"].resolve().parent / Path(name).name
+    if isinstance(truth, str):
+        folder = source.paths[kind].resolve().parent / Path(truth).name
         if (folder / store.DOCUMENT_FILE).is_file():
             points: Any = store.read_document(folder).parameters.get("landmarks_px")
             if isinstance(points, dict):
                 return {key: (float(x), float(y)) for key, (x, y) in points.items()}
     raise SceneError(
-        f"{source.paths['dynamic']}: got maps of an image without landmarks, expected some to map "
+        f"{source.paths[kind]}: got maps of an image without landmarks, expected some to map "
         "them to the mesh; give --landmarks FILE, a table name,x,y of the neutral image"
     )

@@ -295,10 +295,12 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
         Source of the translucency, in words.
     """
     mean_mm, origin = skin_reflectance.population_mean_mm()
-    if not source.fitted:
+    probe = source.appearances.get("probe")
+    measured = [*source.fitted[:1], *([] if probe is None else [probe])]
+    if not measured:
         return gaussian_profiles.fit_gaussians(_typical_r_d(), 1.0 / mean_mm), None, origin
-    appearance = source.fitted[0]
-    r_d = _mean_albedo(appearance)
+    r_d = _mean_albedo(measured[0])
+    appearance = next((one for one in measured if TRANSLUCENCY_MAP in one.maps), measured[0])
     depth = appearance.maps.get(TRANSLUCENCY_MAP)
     if depth is None or not (known := depth.mask & (depth.values > 0).all(-1)).any():
         return gaussian_profiles.fit_gaussians(r_d, 1.0 / mean_mm), None, origin
@@ -308,7 +310,7 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     widths = np.exp(fill_texels(off, known, TRANSLUCENCY_PX)[..., 0])
     record: Any = appearance.parameters.get("reflectance_model")
     fused: Any = appearance.parameters.get(FUSION_KEY, {"maps": {}})
-    by_probe = "probe" in fused["maps"].get(TRANSLUCENCY_MAP, ())
+    by_probe = appearance is probe or "probe" in fused["maps"].get(TRANSLUCENCY_MAP, ())
     if by_probe or (isinstance(record, dict) and record.get("translucency") == "measured"):
         origin = "a fiber probe on this face"
     even = float(np.ptp(widths)) < 1e-3

@@ -203,12 +203,11 @@ def build_surface_assets(source: SceneSource) -> Assets:
     intensity = 1.0 - downsample(fill_holes(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
     why = "simulated; used by the analytic specular model"
-    captured = source.kind in ("dynamic", "dome", "model")
     fine = RELIEF_STEP_WORDS if len(height) >= 2048 else 1
     return {
         "textures": {
             "relief_height": Texture(height.astype(np.float32), "u8", "mipmap", fine=fine),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
         },
-        "left_out": (("pores and roughness of this face", why),) if captured else (),
+        "left_out": (("pores and roughness of this face", why),) if source.captured else (),
     }

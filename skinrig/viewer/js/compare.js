@@ -52,7 +52,8 @@ V.buildComparison = box => {
     show: value => value ? `× ${value}` : "off", help: "A − B times this gain, around gray."}, "difference");
   gain.input.addEventListener("input", V.stopFlip);
   box.append(V.element("p", {className: "label"}, "Compare A with B"),
-    V.element("div", {className: "buttons"}, keep, neutral, scattering, swap, flip, end), slider.box, gain.box,
+    V.element("div", {className: "buttons"}, keep,
+      ...("weights" in V.params ? [neutral, scattering] : []), swap, flip, end), slider.box, gain.box,
     V.element("p", {className: "help"}, "Controls change A, left of the divider. B is fixed."));
   return p => {
     if (!p.compare) V.stopFlip();

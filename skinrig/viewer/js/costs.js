@@ -133,7 +133,7 @@ V.buildCosts = box => {
   };
   button.onclick = () => run(V.params.heads);
   five.onclick = () => run(5);
-  box.append(V.element("div", {className: "buttons"}, button, five), note, result);
+  box.append(V.element("div", {className: "buttons"}, button, ...(V.scene.page === "head" ? [five] : [])), note, result);
 };
 
 V.showCosts = (found, result, note) => {
@@ -148,7 +148,7 @@ V.showCosts = (found, result, note) => {
   const heading = row(head, "th");
   for (const cell of heading.children) cell.setAttribute("scope", "col");
   result.replaceChildren(V.element("table", {},
-    V.element("caption", {}, `${found.heads === 1 ? "One head" : `${found.heads} heads`}, all passes redrawn`),
+    V.element("caption", {}, `${V.scene.page !== "head" ? "The picture" : found.heads === 1 ? "One head" : `${found.heads} heads`}, all passes redrawn`),
     V.element("thead", {}, heading), V.element("tbody", {}, ...lines, total)));
   result.hidden = false;
   note.textContent = `${found.software ? "Software rendering: fractions are meaningful, milliseconds are not. " : ""}` +

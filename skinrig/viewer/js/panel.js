@@ -270,7 +270,7 @@ V.presetsInOrder = () => {
   return Object.fromEntries(Object.entries(V.scene.presets ?? {}).sort(([a], [b]) => rank(a) - rank(b)));
 };
 
-V.describeScene = () => {
+V.describeSource = () => {
   const {provenance = {}, facts, left_out: leftOut = []} = V.scene;
   const title = provenance.title ?? (provenance.kind === "procedural"
     ? `Simulated head, phototype ${provenance.preset}` : (provenance.appearances ?? ["Face"]).join(", "));
@@ -286,7 +286,7 @@ V.describeScene = () => {
     }
     if (facts.albedo_color) add("Color of R_d", facts.albedo_color);
     const vertices = V.scene.mesh.positions.length / 3;
-    add("Geometry", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
+    if (V.scene.page === "head") add("Geometry", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
       `${Object.keys(V.scene.mesh.shapes).length} blend shapes`);
     const errors = Object.entries(V.scene.quantization_error ?? {}).filter(([name]) => !name.startsWith("shape "));
     if (errors.length) {
@@ -301,6 +301,9 @@ V.describeScene = () => {
     leftOut.forEach(([what, why]) => add(`Omitted: ${what}`, why));
     box.append(list);
   }});
+};
+V.describeScene = () => {
+  V.describeSource();
   [V.registerView, V.registerPeople, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,
     V.registerTraits, V.registerRelief, V.registerLight, V.registerSize].forEach(register => register());
 };

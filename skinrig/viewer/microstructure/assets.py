@@ -125,7 +125,7 @@ def build_assets(source: SceneSource) -> Assets:
                 raise
             unusable = f"; the measured relief is not displayed: {error}"
     made = build_relief_assets(simulate_relief(source.seed), source.mesh, seed=source.seed)
-    if source.kind in ("dynamic", "dome", "model"):
+    if source.captured:
         reason = "simulated, with the published kernels of a forehead"
         reason += unusable or "; `skinrig fit microstructure` adds measured ones"
         made["left_out"] = (("microstructure of this face", reason),)

@@ -91,12 +91,22 @@ def test_session_with_maps_is_viewed_next():
 
 
 @pytest.mark.parametrize(
-    "other", [{"files": ()}, {"files": ("mesh.obj",), "maps": ("melanin",)}, {"fusion": {}}]
+    ("other", "shown"),
+    [
+        ({"files": ()}, False),
+        ({"files": ("mesh.obj",), "maps": ("melanin",)}, False),
+        ({"fusion": {}}, False),
+        ({"maps": ("melanin", "hemoglobin")}, False),  # without landmarks
+        ({"maps": ("melanin", "hemoglobin"), "truth": "truth-a"}, True),
+        ({"maps": ("normals_n0", "height_n0")}, True),
+        ({"maps": ("translucency",)}, True),
+    ],
 )
-def test_maps_without_face_are_not_viewed(other):
-    """Maps of flash rig, gradient rig, probe and photographs: `skinrig view` refuses them."""
+def test_maps_are_viewed_where_view_takes_them(other, shown):
+    appearance(Path("truth-a"), kind="truth")
     appearance(Path("appearance"), "session-a", **other)
-    assert [command.split()[1] for command in commands()] == ["report", "export"]
+    wanted = ["report", "view", "export"] if shown else ["report", "export"]
+    assert [command.split()[1] for command in commands()] == wanted
 
 
 def test_whole_face_is_viewed_before_patch_never_truth():

@@ -65,10 +65,12 @@ def test_the_same_scene_gives_the_same_page(scene):
 
 
 def test_every_script_is_packed_and_starter_is_last():
-    found = {entry.name for entry in page._files("js", ".js")}
-    assert found == {f"{name}.js" for name in page.SCRIPT_NAMES}
-    assert page.SCRIPT_NAMES[0] == "graph"
-    assert page.SCRIPT_NAMES[-1] == "main"
+    folder = Path(page.__file__).parent
+    for kind, names in (("js", page.SCRIPT_NAMES), ("glsl", page.GLSL_NAMES)):
+        used = {f"{name}.{kind}" for names_of_page in names.values() for name in names_of_page}
+        assert {path.name for path in folder.joinpath(kind).iterdir()} == used
+    for scripts in page.SCRIPT_NAMES.values():
+        assert (scripts[0], scripts[-1]) == ("graph", "main")
 
 
 def test_comments_are_removed_from_page_but_code_kept():
@@ -112,7 +114,7 @@ def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
     from model import store
 
     flat = SkinAppearance(
-        maps={"normals": SkinMap(np.zeros((4, 4, 3), np.float32), "1")},
+        maps={"shading": SkinMap(np.zeros((4, 4), np.float32), "1")},
         source="measured",
         parameters={"kind": "appearance"},
         inputs={},

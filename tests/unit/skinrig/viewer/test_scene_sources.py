@@ -16,6 +16,7 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.viewer import faces as procedural
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import placed_color
+from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.scene import SceneError, SceneSource
 
 STATES = ("smile", "exercise")
@@ -113,6 +114,40 @@ def test_blood_from_image_maps_to_its_face_position(subject, folder):
     assert np.median(truth[front]) > 1.1
     assert scale.shape == mean.shape
     assert found.facts["leave_one_out_px"] < 1.0
+
+
+def test_chromophores_of_flash_maps_reach_their_place(subject, folder):
+    """The maps of a neutral face alone: blood of expressions is scaled as simulated."""
+    moving, _ = dynamic_appearance.read(folder / "appearance")
+    maps = {name: moving.maps[name] for name in ("melanin", "hemoglobin")}
+    flash = SkinAppearance(maps, "simulated", {"kind": "appearance"}, {}, seed=3)
+    store.write(folder / "flash", flash)
+    kept = {"appearances": {"flash": flash}, "paths": {"flash": folder / "flash"}}
+    of = "flash", procedural.build_viewer_mesh(subject), SIZE, 0, subject
+    skin = FineSkin(subject, SIZE)
+    source = SceneSource(*of, skin, **kept, landmarks=folder / "landmarks.csv")
+    found = facial_color_assets._face(source, measured=False)
+    front = subject.atlas.covered & (subject.atlas.normal[..., 2] > 0.6)
+    for name, texels in (("melanin", subject.melanin), ("hemoglobin", subject.hemoglobin())):
+        placed = getattr(found, name)
+        assert np.median(np.abs(placed / texels - 1.0)[front]) < 0.05
+        assert np.median(np.abs(placed[:, ::-1] / texels - 1.0)[front]) > 0.06  # it can fail
+    mean, exercise = (found.states[state][..., 1] for state in ("neutral", "exercise"))
+    step = SIZE // mean.shape[0]
+    ratio = (exercise / mean).repeat(step, 0).repeat(step, 1)
+    truth = subject.hemoglobin("exercise") / subject.hemoglobin()
+    assert np.median(np.abs(ratio / truth - 1.0)[front]) < 0.05
+    assert "blood of expressions" in dict(found.left_out)
+
+
+def test_two_colors_of_one_face_are_refused(folder):
+    moving, _ = dynamic_appearance.read(folder / "appearance")
+    maps = {name: moving.maps[name] for name in ("melanin", "hemoglobin")}
+    store.write(folder / "second", SkinAppearance(maps, "simulated", {"kind": "appearance"}, {}))
+    with pytest.raises(SceneError, match="has the color of the face"):
+        procedural.build_scene([folder / "appearance", folder / "second"], size=64)
+    with pytest.raises(SceneError, match="--landmarks FILE"):
+        procedural.build_scene([folder / "second"], size=64)
 
 
 def test_image_without_landmarks_is_refused_with_remedy(folder):
