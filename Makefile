@@ -6,12 +6,15 @@ PYTEST := PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest
 # files in the order of tests/conftest.py, the longest first, not that of how many tests they have
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
+# make test-long PART=2/3: the second of three parts, each for a machine of its own
+PART := 1/1
+
 .PHONY: help setup browser firmware demo test test-long lint docs bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, fuse, report (leaves ./demo)"
 	@echo "make test       every test but the long ones"
-	@echo "make test-long  the long ones"
+	@echo "make test-long  the long ones (PART=2/3: the second of three parts)"
 	@echo "make lint       ruff, mypy and the import contracts"
 	@echo "make docs       the documentation site, into ./site (open site/index.html)"
 	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
@@ -43,10 +46,10 @@ lint: .venv/.ready
 	@.venv/bin/lint-imports
 
 test: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) -m "not long"
+	@$(PYTEST) -q $(WORKERS) -m "not long" --part $(PART)
 
 test-long: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) --durations 25 -m long tests
+	@$(PYTEST) -q $(WORKERS) --durations 25 -m long --part $(PART) tests
 
 # the variable silences a note of mkdocs-material on its successor
 docs: .venv/.ready

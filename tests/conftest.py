@@ -71,6 +71,9 @@ def pytest_addoption(parser):
     parser.addoption(
         "--record-durations", action="store_true", help=f"write {DURATIONS.name} from this run"
     )
+    parser.addoption(
+        "--part", default="1/1", help="run one part of the files, 2/3 the second of three"
+    )
 
 
 @hypothesis.settings(max_examples=1)
@@ -150,10 +153,35 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def choose_files(part, tests, seconds):
+    """Return the files of one part; parts take about as long, and each file is in one.
+
+    ``part`` is "2/3" for the second of three; ``tests`` counts the tests by file, ``seconds`` has
+    recorded durations. The longest files go first, each to the part with the least to do.
+    """
+    try:
+        number, count = (int(one) for one in part.split("/"))
+    except ValueError:
+        number, count = 0, 0
+    if not 1 <= number <= count:
+        raise pytest.UsageError(f"--part: got {part!r}, expected such as 2/3")
+    loads = [0.0] * count
+    chosen = set()
+    for path in sorted(tests, key=lambda path: (-seconds.get(path, 0.0), str(path))):
+        least = loads.index(min(loads))
+        loads[least] += max(seconds.get(path, 0.0), 0.01 * tests[path])
+        if least == number - 1:
+            chosen.add(path)
+    return chosen
+
+
 @pytest.hookimpl(trylast=True)  # what is not asked for has been left out
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     seconds = recorded_durations_s()
     tests = Counter(item.path for item in items)
+    part = choose_files(config.getoption("part"), tests, seconds)
+    config.hook.pytest_deselected(items=[item for item in items if item.path not in part])
+    items[:] = [item for item in items if item.path in part]
     number = {path: count for count, path in enumerate(tests)}  # a file's tests stay together
 
     def order(item):
