@@ -14,25 +14,24 @@ import typer
 from typer.main import get_command
 
 from skinrig import errors, kernel_cache
+from skinrig.command_line import completion, options
+from skinrig.command_line.help import Command, Commands
+from skinrig.command_line.options import Json, Out, Seed, option
 from skinrig.commands import (
     analysing,
     capturing,
-    completion,
     dynamic,
     editing,
     export,
     fusing,
     importing,
     measuring,
-    options,
     planning,
     reconstructing,
     rendering,
     showing,
     simulating,
 )
-from skinrig.commands.help import Command, Commands
-from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console, EscapingFormatter, escape_controls
 from skinrig.next_steps import format_welcome
 from skinrig.progress import beat_while_running, watch_start

@@ -181,7 +181,7 @@ def command_pages() -> dict[str, str]:
 
 
 def _command_index(root: Any) -> str:
-    from skinrig.commands.help import HELP_SECTIONS, OTHER_SECTION, summarize_command
+    from skinrig.command_line.help import HELP_SECTIONS, OTHER_SECTION, summarize_command
 
     lines = ["# Command line", "", root.help, ""]
     left = dict(root.commands)
@@ -221,7 +221,7 @@ def _help(text: str | None) -> list[str]:
 
 def _options(command: Any) -> list[str]:
     """Return a table of a command's arguments and options."""
-    from skinrig.commands.help import format_argument
+    from skinrig.command_line.help import format_argument
 
     context = command.make_context(command.name, [], resilient_parsing=True)
     rows = []

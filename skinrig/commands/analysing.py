@@ -5,8 +5,8 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out, choice, command, option
+from skinrig.command_line.help import Command, Subcommands
+from skinrig.command_line.options import Json, Out, choice, command, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError, require_choice
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skinrig import errors
-from skinrig.commands import options
-from skinrig.commands.help import Command, Commands, RigCommand, RigFileGroup
-from skinrig.commands.options import choice, command, target_option
+from skinrig.command_line import options
+from skinrig.command_line.help import Command, Commands, RigCommand, RigFileGroup
+from skinrig.command_line.options import choice, command, target_option
 from skinrig.console import Console, format_count, select_attributes
 
 if TYPE_CHECKING:

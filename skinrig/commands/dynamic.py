@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from reconstruction.correspondence import landmark_table
-from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps, choice, command
+from skinrig.command_line.help import Command, Subcommands
+from skinrig.command_line.options import Json, NewMaps, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, require_choice
 from skinrig.next_steps import shell_quote

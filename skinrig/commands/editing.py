@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
+from skinrig.command_line.options import Json, NewMaps, Out, Seed, choice, command, option
 from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, NewMaps, Out, Seed, choice, command, option
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, require_choice
 from skinrig.next_steps import shell_quote

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from skinrig.commands.options import Json, Out, choice, command
+from skinrig.command_line.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, require_choice
 from skinrig.exporting.options import ExportSettings, SkinPosition

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands.options import Json, Out, command
+from skinrig.command_line.options import Json, Out, command
 from skinrig.console import Console
 from skinrig.next_steps import shell_quote
 

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
-from skinrig.commands.help import Command, ImportCommands
-from skinrig.commands.options import (
+from skinrig.command_line.help import Command, ImportCommands
+from skinrig.command_line.options import (
     Consent,
     ConsentExpires,
     Json,

@@ -8,9 +8,9 @@ import typer
 
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
-from skinrig.commands import completion, options
-from skinrig.commands.options import Json, Out, Seed, command
-from skinrig.commands.renamed_options import FORMER_STAGES, replace_former_values
+from skinrig.command_line import completion, options
+from skinrig.command_line.options import Json, Out, Seed, command
+from skinrig.command_line.renamed_options import FORMER_STAGES, replace_former_values
 from skinrig.console import Console, select_attributes
 from skinrig.doctor import FIX_KEY, check_controller, check_installation
 from skinrig.kernel_cache import set_passive_waiting

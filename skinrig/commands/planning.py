@@ -9,8 +9,8 @@ import typer
 
 from skinrig import errors
 from skinrig.atomic_file import write_atomically
-from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import Bands, Json, Subject, check_output_file, command, option
+from skinrig.command_line.help import RigCommand, RigGroup
+from skinrig.command_line.options import Bands, Json, Subject, check_output_file, command, option
 from skinrig.console import Console, select_attributes
 from skinrig.next_steps import shell_quote
 from skinrig.unit_format import format_quantity

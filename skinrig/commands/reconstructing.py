@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands import completion
-from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import (
+from skinrig.command_line import completion
+from skinrig.command_line.options import (
     ExecutorName,
     Json,
     MeshFile,
@@ -20,7 +19,8 @@ from skinrig.commands.options import (
     choice,
     command,
 )
-from skinrig.commands.renamed_options import replace_former_values
+from skinrig.command_line.renamed_options import replace_former_values
+from skinrig.commands.dynamic import print_fit
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
 from skinrig.next_steps import shell_quote, suggest

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, choice, command
+from skinrig.command_line.options import Json, Out, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
 

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands import completion
-from skinrig.commands.options import (
+from skinrig.command_line import completion
+from skinrig.command_line.options import (
     STDOUT_MARK,
     Json,
     Page,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from skinrig.commands import completion, options
-from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import command, option, target_option
+from skinrig.command_line import completion, options
+from skinrig.command_line.help import RigCommand, RigGroup
+from skinrig.command_line.options import command, option, target_option
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import suggest_after_session
 

@@ -110,8 +110,8 @@ def test_a_default_of_none_shows_in_the_annotation():
 
 
 def test_a_hidden_none_would_be_found():
-    imports = "from skinrig.commands.options import Json, Site\n"
-    modules_alone = "from skinrig.commands import options\n"
+    imports = "from skinrig.command_line.options import Json, Site\n"
+    modules_alone = "from skinrig.command_line import options\n"
     for code in (
         "def f(a: int = None, b: int | None = None): ...",
         imports + "def f(a: Json = None, b: Site = None): ...",

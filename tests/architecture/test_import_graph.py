@@ -14,7 +14,6 @@ import pytest
 from fixtures.product_code import PACKAGES, ROOT, modules, tree_of
 
 MAX_MODULES = 15
-MAX_MODULES_OF = {"skinrig/commands": 17}
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 
 
@@ -79,7 +78,7 @@ def test_circles_would_be_found(tmp_path):
 def crowded(root):
     paths = (p.relative_to(root) for package in PACKAGES for p in (root / package).rglob("*.py"))
     modules = Counter(path.parent.as_posix() for path in paths if path.name != "__init__.py")
-    return {n: count for n, count in modules.items() if count > MAX_MODULES_OF.get(n, MAX_MODULES)}
+    return {n: count for n, count in modules.items() if count > MAX_MODULES}
 
 
 def test_no_folder_is_crowded():

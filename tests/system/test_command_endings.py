@@ -12,7 +12,7 @@ from capture.rig import load_rig
 from capture.session.disk import Disk
 from skinrig import errors
 from skinrig.cli import main
-from skinrig.commands import completion
+from skinrig.command_line import completion
 
 
 def photograph(path, color=True, seed=0):

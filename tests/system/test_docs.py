@@ -27,7 +27,7 @@ from rigsim.boxes.controller import Controller
 from rigsim.boxes.device import Wiring
 from rigsim.boxes.flash import FlashUnit
 from skinrig.cli import app
-from skinrig.commands.help import RigFileGroup, RigGroup
+from skinrig.command_line.help import RigFileGroup, RigGroup
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -8,7 +8,7 @@ import typer
 
 from skinrig import errors
 from skinrig.cli import app, main
-from skinrig.commands.help import RigGroup
+from skinrig.command_line.help import RigGroup
 
 SPEECHLESS = ("demo", "doctor", "view", "bench", "soak")
 """Commands that need no argument at all."""

@@ -8,7 +8,7 @@ import pytest
 import typer
 
 from skinrig.cli import app
-from skinrig.commands.help import RigGroup
+from skinrig.command_line.help import RigGroup
 
 PAGES = sorted((Path(__file__).parents[2] / "docs/validation").glob("paper-*.md"))
 COMMAND = re.compile(r"`skinrig ([^`]+)`")

@@ -17,8 +17,8 @@ from model.traits.vectors import Contrast
 from reconstruction.brdf_basis.space import Method
 from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES
 from skinrig.cli import app, main
+from skinrig.command_line.renamed_options import RENAMED_OPTIONS, format_notice
 from skinrig.commands.export import FORMATS
-from skinrig.commands.renamed_options import RENAMED_OPTIONS, format_notice
 from skinrig.exporting.export import APPEARANCE_FORMATS, SESSION_FORMATS
 from skinrig.exporting.options import METERS_PER_UNIT
 from skinrig.rendering.render import Subsurface

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skinrig.commands import completion
+from skinrig.command_line import completion
 
 
 def offered(words):

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from skinrig.atomic_file import require_writable
-from skinrig.commands import completion
-from skinrig.commands.help import HELP_ALL
+from skinrig.command_line import completion
+from skinrig.command_line.help import HELP_ALL
 from skinrig.errors import UnusableError, UsageError, require_choice
 
 if TYPE_CHECKING:

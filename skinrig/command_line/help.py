@@ -8,7 +8,11 @@ from typing import Any, Final, cast
 
 from typer.core import TyperCommand, TyperGroup
 
-from skinrig.commands.renamed_options import format_notice, renamed_options_of, replace_former_names
+from skinrig.command_line.renamed_options import (
+    format_notice,
+    renamed_options_of,
+    replace_former_names,
+)
 from skinrig.errors import UnusableError, UsageError
 
 HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (

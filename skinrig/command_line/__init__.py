@@ -1,0 +1,1 @@
+"""Syntax of the command line: help, options, their former names, completion."""
