@@ -1,12 +1,14 @@
 """Evaluate fused people against the best single rig, over simulated sessions of all skin types.
 
-    python tools/judge_fused_people.py WORK [--people N] [--first SEED]
+    python tools/judge_fused_people.py WORK [--people N] [--first SEED] [--tissue published]
 
-Person k has seed FIRST + k and skin type I to VI in turn. Dome (320 px), flash rig (384 px) and
-probe are simulated with a calibration of their own, reconstructed and fused. WORK keeps the
-sessions, so that an interrupted run continues; ``--people 0`` only evaluates them. Printed per
-quantity: median errors of the logarithm and coverage of 68 % intervals, means over people, and
-the number of people whose fused error is at most that of the best single rig, without tolerance.
+Person k has seed FIRST + k and skin type I to VI in turn. With ``--tissue published`` the other
+properties of the skin fill their published ranges, as the intervals state. Dome (320 px), flash rig
+(384 px) and probe are simulated with a calibration of their own, reconstructed and fused. WORK
+keeps the sessions, so that an interrupted run continues; ``--people 0`` only evaluates them.
+Printed per quantity: median errors of the logarithm and coverage of 68 % intervals, means over
+people, and the number of people whose fused error is at most that of the best single rig, without
+tolerance.
 A person takes about 150 s of processor time.
 """
 
@@ -23,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from model import store
+from rigsim.population.files import DRAWN_TISSUE, SCHEMA, TISSUE_SPREADS
 from skinrig.demo_rigs import (
     DOME_OMITTED_EFFECTS,
     DOME_WIDTH_PX,
@@ -40,8 +43,11 @@ FLASH_WIDTH_PX = 384
 RIGS = ("flash", "dome", "probe")
 
 
-def capture(folder: Path, subject: str, seed: int) -> None:
+def capture(folder: Path, skin_type: str, seed: int, tissue: str) -> None:
     """Simulate, calibrate and reconstruct a person's sessions that `folder` lacks."""
+    subject = folder / "subject.toml"
+    lines = f'schema = "{SCHEMA}"', f'preset = "{skin_type}"', f'tissue_model = "{tissue}"'
+    subject.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     @contextmanager
     def share(_step: str) -> Iterator[None]:
@@ -59,12 +65,12 @@ def capture(folder: Path, subject: str, seed: int) -> None:
         "dome": (
             [("geometry", ("charuco",)), ("lights", ("mirror", "white"))],
             dome,
-            ("normals", "r_d"),
+            ("normals", "normals_refined", "r_d"),
         ),
         "probe": ([("fiber", ("phantom",))], {}, PROBE_WANT),
     }
     for rig, (kinds, size, want) in plans.items():
-        if (folder / f"appearance-{rig}-{subject}").is_dir():
+        if (folder / f"appearance-{rig}-{skin_type}").is_dir():
             continue
         for one in folder.glob(f"*-{rig}*"):
             shutil.rmtree(one)
@@ -74,7 +80,7 @@ def capture(folder: Path, subject: str, seed: int) -> None:
                 run.simulate(rig, target, target=target, **size)
             run.calibrate(rig, kind, *targets)
         omitted = {"leave_out": DOME_OMITTED_EFFECTS} if rig == "dome" else {}
-        done = run.simulate(rig, subject, subject=subject, **size, **omitted)
+        done = run.simulate(rig, skin_type, subject=str(subject), **size, **omitted)
         run.reconstruct(rig, done, want)
         print(f"{folder.name} {rig}: {time.process_time() - begun:.0f} s", file=sys.stderr)
 
@@ -95,12 +101,13 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--people", type=int, default=10)
     parser.add_argument("--first", type=int, default=6200)
+    parser.add_argument("--tissue", choices=tuple(TISSUE_SPREADS), default=DRAWN_TISSUE)
     given = parser.parse_args()
     for k in range(given.people):
-        seed, subject = given.first + k, TYPES[k % len(TYPES)]
-        folder = given.work / f"{seed}-{subject}"
+        seed, skin_type = given.first + k, TYPES[k % len(TYPES)]
+        folder = given.work / f"{seed}-{skin_type}"
         folder.mkdir(parents=True, exist_ok=True)
-        capture(folder, subject, seed)
+        capture(folder, skin_type, seed, given.tissue)
     found: dict[str, list[FusionAccuracy]] = {}
     print("person quantity fused% single% coverage, fused and single%")
     for folder in sorted(given.work.iterdir()):
