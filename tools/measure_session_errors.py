@@ -9,7 +9,8 @@ benchmark `repeatability` has seed 0. Sessions are 30 days apart, each with its 
 Printed per quantity: rms difference, the stated one, their ratio with its standard error over
 pairs, and the errors common to the whole skin and to a region in stated standard uncertainties:
 those of `skinrig/data/session_errors.csv` before their factor. Then pairs judged as changed, and
-per age the change of each calibration in combined standard errors and relative to its numbers.
+per age the change of each calibration in combined standard errors and relative to its numbers:
+the rows of `skinrig/data/calibration_drift.csv`.
 """
 
 from __future__ import annotations
@@ -44,11 +45,12 @@ def print_trials(found: list[RigTrials]) -> None:
 
 def print_drifts(folder: Path, protocol: RigProtocol, ages_days: list[int]) -> None:
     """Print the change of each calibration with age."""
-    print("calibration days numbers rms-sigmas median-change-%")
+    print("rig,kind,days,numbers,sigmas,percent")
     for one in measure_drifts(folder, protocol, ages_days):
         rms = float(np.sqrt(np.mean(one.sigmas**2))) if one.sigmas.size else float("nan")
         change = f"{100 * one.relative:.2g}"
-        print(one.kind, one.days, one.sigmas.size, f"{rms:.2g}", change, sep="; ", flush=True)
+        row = protocol.rig, one.kind, one.days, one.sigmas.size, f"{rms:.2g}", change
+        print(*row, sep=",", flush=True)
 
 
 def main() -> None:

@@ -30,6 +30,7 @@ from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.fitting import probe_sites
 from skinrig.fusing.description import describe_checks, describe_patch, describe_person
 from skinrig.fusing.filled_normals import MEASURED_SUFFIX, fill_normals
+from skinrig.fusing.filled_skin import fill_skin
 from skinrig.fusing.maps import FUSED_MAPS, estimate_maps
 from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
@@ -183,6 +184,8 @@ def fuse_sources(
     carried = [name for name in maps if name not in FUSED_MAPS]
     position = base.appearance.maps.get("position")
     fused, p_value = estimate_maps(measured, person, errors, position=position, progress=report)
+    if position is not None:
+        fused = fill_skin(fused, position)
     maps = {name: maps[name] for name in carried}
     if position is not None:
         for name in [name for name in NORMAL_MAPS if name in maps]:
