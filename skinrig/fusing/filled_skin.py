@@ -1,4 +1,4 @@
-"""Fill the gaps of a fused person's R_d and chromophores from measured texels around them."""
+"""Fill the gaps of a fused person's colors and translucency from measured texels around them."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,10 +18,12 @@ LOG_SPREAD_FACTORS: Final[Mapping[str, float]] = {
     "melanin": 2.5,
     "melanin_optical_depth": 2.5,
     "hemoglobin": 2.5,
+    "translucency": 2.5,
 }
 """Standard error of the logarithm of a filled value over the spread of its neighbors' logarithms.
 
-Set on three simulated faces, of types I, IV and VI, see docs/validation/fusion.md."""
+Set on three simulated faces, of types I, IV and VI, see docs/validation/fusion.md; that of the
+translucency, which has no ground truth per texel, is assumed."""
 
 
 def fill_skin(maps: Mapping[str, SkinMap], position: SkinMap) -> dict[str, SkinMap]:
