@@ -29,6 +29,8 @@ from pathlib import Path
 import numpy as np
 
 from model import store
+from model.skin import SkinAppearance
+from model.skin_reflectance import TRANSLUCENCY_MAP
 from reconstruction.fusion.signals import residual_covariance
 from reconstruction.fusion.texels import OffsetModel
 from reconstruction.surface.errors import interior_error
@@ -42,8 +44,9 @@ from skinrig.demo_rigs import (
     DemoResults,
     RigDemo,
 )
+from skinrig.evaluating import subsurface, surface
 from skinrig.evaluating.fusion import FusionAccuracy, compare_filled, compare_fused
-from skinrig.fusing.double import FusionInputs, fuse_sources
+from skinrig.fusing.double import FusedDouble, FusionInputs, fuse_sources
 from skinrig.fusing.maps import estimate_maps
 from skinrig.fusing.measurements import LOCAL_SHARE, Measurements
 from skinrig.fusing.sources import read_sources
@@ -148,9 +151,36 @@ def evaluate(folder: Path) -> tuple[list[FusionAccuracy], list[FusionAccuracy]]:
     for row in compare_filled(fused, truths):
         figures = 100 * row.share, 100 * row.error, 100 * row.coverage
         print(folder.name, "filled", row.quantity, row.texels, *(f"{one:.1f}" for one in figures))
+    print_other_maps(folder, double, single["dome"], truths["dome"])
     placement = double.measured.placement
     first, second = (compare_fused(one, single, truths, placement) for one in (fused, other))
     return first, second
+
+
+def print_other_maps(
+    folder: Path, double: FusedDouble, dome: SkinAppearance, truth: SkinAppearance
+) -> None:
+    """Print errors of normals, fused and of the dome, and of sigma_tr at the probe's sites."""
+    rng = np.random.default_rng(0)
+    for what, one in (("fused", double.appearance), ("dome", dome)):
+        for row in surface.compare(one, truth, rng=rng):
+            if row.unit == "deg":
+                held, masked = 100 * row.coverage.fraction, 100 * row.masked
+                figures = f"{row.mean:.2f} deg, coverage {held:.0f} %, masked {masked:.1f} %"
+                print(folder.name, what, row.name, figures)
+    known = subsurface.true_profiles(store.read(next(folder.glob("truth-probe-[IV]*"))))
+    mean_free_path = double.appearance.maps[TRANSLUCENCY_MAP]
+    for site in double.measured.sites:
+        true = [one["sigma_tr_per_mm"] for one in known.values() if one["site"] == site.name]
+        log_true = np.log(np.mean(true, axis=0))
+        fused = -np.log(mean_free_path.values[site.texel]) - log_true
+        probe = np.log(site.sigma_tr_per_mm) - log_true
+        errors = mean_free_path.stderr[site.texel] / mean_free_path.values[site.texel]
+        held = int((np.abs(fused) < errors).sum())
+        rows = [" ".join(f"{100 * one:+.1f}" for one in part) for part in (fused, probe)]
+        print(
+            folder.name, "sigma_tr", site.name, f"fused {rows[0]}; probe {rows[1]} %; held {held}/3"
+        )
 
 
 def print_table(people: dict[str, list[FusionAccuracy]]) -> None:
