@@ -151,8 +151,8 @@ def compare_filled(
         truth = truths["dome" if name == "r_d" else "flash"]
         place = truth.maps["position" if name == "r_d" else "position_mm"]
         true_map = truth.maps[name]
-        known = true_map.mask & (true_map.values.reshape(*true_map.mask.shape, -1) > 0.0).all(-1)
-        flat = true_map.values.reshape(*true_map.mask.shape, -1)
+        flat = true_map.values.reshape(*true_map.mask.shape, -1).astype(np.float64)
+        known = true_map.mask & (flat > 0.0).all(axis=-1)
         near, true = _match(fused.maps["position"], place, known, flat)
         filled = near & (measured.values.reshape(-1) == 0.0) & measured.mask.reshape(-1)
         if (count := int(filled.sum())) < MIN_TEXELS:

@@ -26,7 +26,7 @@ Set on three simulated faces, of types I, IV and VI, see docs/validation/fusion.
 translucency, which has no ground truth per texel, is assumed."""
 
 
-def fill_skin(maps: Mapping[str, SkinMap], position: SkinMap) -> dict[str, SkinMap]:
+def fill_skin(maps: Mapping[str, SkinMap], position: SkinMap | None) -> dict[str, SkinMap]:
     """Fill gaps of R_d, melanin and blood whose neighborhood is measured.
 
     Few images show places such as the sides of the nose or the folds of lips and brows. A filled
@@ -38,7 +38,7 @@ def fill_skin(maps: Mapping[str, SkinMap], position: SkinMap) -> dict[str, SkinM
     maps
         Fused maps with standard errors, of H x W texels.
     position
-        Surface points of the same texels, mm.
+        Surface points of the same texels, mm; None: nothing is filled.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def fill_skin(maps: Mapping[str, SkinMap], position: SkinMap) -> dict[str, SkinM
     found = dict(maps)
     for name, factor in LOG_SPREAD_FACTORS.items():
         one = maps.get(name)
-        if one is None:
+        if one is None or position is None:
             continue
         own = maps.get(f"{name}{OWN_SUFFIX}")
         found |= _fill_map(name, one, own, position, factor)

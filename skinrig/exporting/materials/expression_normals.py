@@ -51,6 +51,7 @@ def expression_normals(appearance: SkinAppearance, material: Material) -> dict[s
         moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
         moved = np.where(shown.valid[..., None], moved, 0.0)
         if moved.shape != neutral.shape:
-            moved = resample(moved, (neutral.shape[0], neutral.shape[1]))
+            size = (neutral.shape[0], neutral.shape[1])
+            moved = np.asarray(resample(moved, size), np.float64)
         found[str(name)] = wrinkles.decode(neutral + moved).astype(np.float32)
     return found
