@@ -9,8 +9,8 @@ benchmark `repeatability` has seed 0. Sessions are 30 days apart, each with its 
 Printed per quantity: rms difference, the stated one, their ratio with its standard error over
 pairs, and the errors common to the whole skin and to a region in stated standard uncertainties:
 those of `skinrig/data/session_errors.csv` before their factor. Then pairs judged as changed, and
-per age the change of each calibration in combined standard errors and relative to its numbers:
-the rows of `skinrig/data/calibration_drift.csv`.
+per age the typical change of each calibration in combined standard errors, 1 by noise alone, and
+relative to its numbers: the rows of `skinrig/data/calibration_drift.csv`.
 """
 
 from __future__ import annotations
@@ -45,12 +45,18 @@ def print_trials(found: list[RigTrials]) -> None:
 
 def print_drifts(folder: Path, protocol: RigProtocol, ages_days: list[int]) -> None:
     """Print the change of each calibration with age."""
-    print("rig,kind,days,numbers,sigmas,percent")
+    print("rig,kind,quantity,days,numbers,sigmas,percent")
     for one in measure_drifts(folder, protocol, ages_days):
-        rms = float(np.sqrt(np.mean(one.sigmas**2))) if one.sigmas.size else float("nan")
-        change = f"{100 * one.relative:.2g}"
-        row = protocol.rig, one.kind, one.days, one.sigmas.size, f"{rms:.2g}", change
-        print(*row, sep=",", flush=True)
+        for quantity in dict.fromkeys(row.name.split("[")[0] for row in one.moved):
+            rows = [row for row in one.moved if row.name.split("[")[0] == quantity]
+            sigmas = [abs(row.sigmas) for row in rows if row.sigmas is not None]
+            relative = [abs(row.change / row.old) for row in rows if row.old]
+            if not relative:
+                continue
+            # a standard deviation by the median: a few numbers have errors near 0
+            size = f"{np.median(sigmas) / 0.6745:.2g}" if sigmas else ""
+            found = protocol.rig, one.kind, quantity, one.days, len(rows), size
+            print(*found, f"{100 * np.median(relative):.2g}", sep=",", flush=True)
 
 
 def main() -> None:

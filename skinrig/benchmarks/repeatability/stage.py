@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from capture.calibration import store as calibrations
+from capture.calibration.validity import CalibrationDrift as NumberDrift
 from model.skin import SkinAppearance
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.repeatability.sessions import RigDay, RigProtocol, choose_protocol
@@ -82,6 +83,8 @@ class CalibrationDrift:
     """Change of each quantity with an uncertainty, in combined standard uncertainties."""
     relative: float
     """Median relative change of quantities other than 0; 0 without any."""
+    moved: tuple[NumberDrift, ...] = ()
+    """All changes."""
 
     @classmethod
     def between(cls, kind: str, old: RigDay, new: RigDay, *, days: int) -> CalibrationDrift:
@@ -90,7 +93,7 @@ class CalibrationDrift:
         moved = calibrations.measure_drift(*pair)
         sigmas = np.array([one.sigmas for one in moved if one.sigmas is not None])
         relative = [abs(one.change / one.old) for one in moved if one.old]
-        return cls(kind, days, sigmas, float(np.median(relative)) if relative else 0.0)
+        return cls(kind, days, sigmas, float(np.median(relative)) if relative else 0.0, moved)
 
 
 @dataclass(slots=True)

@@ -166,11 +166,17 @@ def _age(
 
 @cache
 def _drifts() -> list[tuple[str, str, int, float, float]]:
-    """Return rig, kind, age in days, rms change in standard errors, and median change in %."""
+    """Return rig, kind, age in days, rms change in standard errors or 0, and median change in %."""
     text = resources.files("skinrig").joinpath("data/calibration_drift.csv").read_text()
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     return [
-        (row["rig"], row["kind"], int(row["days"]), float(row["sigmas"]), float(row["percent"]))
+        (
+            row["rig"],
+            row["kind"],
+            int(row["days"]),
+            float(row["sigmas"] or 0.0),
+            float(row["percent"]),
+        )
         for row in rows
     ]
 
@@ -201,7 +207,8 @@ def describe_drift(rig: str, kind: str, age_days: int) -> str:
     if not ages:
         return ""
     days, sigmas, percent = next((row for row in ages if row[0] >= age_days), ages[-1])
-    return f"{percent:g} %, {sigmas:g} standard errors at {days} days"
+    spread = f", {sigmas:g} standard errors" if sigmas else ""
+    return f"{percent:g} %{spread} at {days} days"
 
 
 def count_days_left(found: Calibration, day: date) -> int:
