@@ -14,7 +14,7 @@ freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
 beard            stubble of a member, 0 to 1; its own if omitted
 tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
-                 "typical", or "papers" (the papers' model)
+                 "published" (from whole published ranges), "typical", or "papers" (papers' model)
 epidermis_mm     thickness of the epidermis, mm, at equal melanin per area; this and the next ones
                  replace those of the model, in `rigsim.tissue.skin_layers.PROPERTY_RANGES`
 ...              site_contrast, basal_melanin_fraction, epidermal_blood_ratio, oxygenation,
@@ -49,14 +49,15 @@ from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_textur
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
-from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin, draw_tissue
+from rigsim.subject.person_skin import MELANIN_RANGE, PUBLISHED_SPREAD, PersonSkin, draw_tissue
 from rigsim.subject.skin_tone import SkinToneError, is_skin_tone, melanin_of_tone
 from rigsim.tissue.skin_layers import PAPER_SKIN, PROPERTY_RANGES, TYPICAL_SKIN, TissueProperties
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
 DRAWN_TISSUE: Final = "drawn"
-"""Name of the properties that are drawn from the seed."""
+TISSUE_SPREADS: Final[Mapping[str, float]] = {DRAWN_TISSUE: 1.0, "published": PUBLISHED_SPREAD}
+"""Spreads of the properties that are drawn from the seed, by name."""
 NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {
     "typical": TYPICAL_SKIN,
     "papers": PAPER_SKIN,
@@ -64,10 +65,7 @@ NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {
 """Named properties of skin that do not vary."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _MEMBER_KEYS: Final = ("schema", "member", "melanin", "blood", "freckles", "oil", "beard")
-_UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "gradient": ("oil", *_FILE_KEYS),
-    "probe": ("oil", *_FILE_KEYS),
-}
+_UNUSED_KEYS: Final = dict.fromkeys(("gradient", "probe"), ("oil", *_FILE_KEYS))
 """Keys without effect in a rig: a patch of plain skin, and skin by its layers."""
 
 
@@ -90,7 +88,7 @@ class SubjectFile(Document):
     beard: float | None = None
     """None: that of the member."""
     tissue_model: str = DRAWN_TISSUE
-    """`DRAWN_TISSUE`, or one of `NAMED_TISSUES`."""
+    """One of `TISSUE_SPREADS` or `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
     """None: that of the model, as for the next ones."""
     site_contrast: float | None = None
@@ -115,7 +113,7 @@ class SubjectFile(Document):
         checks.check("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
         known = ", ".join(PRESET_NAMES)
         checks.check("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
-        models = (DRAWN_TISSUE, *NAMED_TISSUES)
+        models = (*TISSUE_SPREADS, *NAMED_TISSUES)
         known = f"one of {', '.join(models)}"
         checks.check("tissue_model", self.tissue_model, self.tissue_model in models, known)
         for name, low, high in (
@@ -186,7 +184,8 @@ class SubjectFile(Document):
         """Return the properties of the skin except for melanin and blood."""
         given = {name: getattr(self, name) for name in PROPERTY_RANGES}
         own = {name: value for name, value in given.items() if value is not None}
-        model = NAMED_TISSUES.get(self.tissue_model) or draw_tissue(seed)
+        spread = TISSUE_SPREADS.get(self.tissue_model, 0.0)
+        model = NAMED_TISSUES.get(self.tissue_model) or draw_tissue(seed, spread=spread)
         return dataclasses.replace(model, **own)
 
     def face(

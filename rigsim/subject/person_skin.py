@@ -58,6 +58,9 @@ people of the population lie outside 5 to 95 % of measured skin."""
 
 MAX_DEVIATIONS: Final = 2.0
 """Standard deviations within which people's properties lie."""
+PUBLISHED_SPREAD: Final = 2.5
+"""Spread at which these deviations are a quarter of each published range, as the range of plus and
+minus two standard deviations."""
 
 
 class PersonSkinError(ValueError):
@@ -227,7 +230,9 @@ def _maps_at(
     return melanin, perfusion.blood(state)
 
 
-def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissueProperties:
+def draw_tissue(
+    seed: int, typical: TissueProperties = TYPICAL_SKIN, *, spread: float = 1.0
+) -> TissueProperties:
     """Draw the properties of a person's skin except for melanin and blood.
 
     Parameters
@@ -237,6 +242,8 @@ def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissuePr
     typical
         Properties around which people vary. The thickness between sites of one face has the
         published contrast.
+    spread
+        Factor of the deviations; `PUBLISHED_SPREAD` fills the published ranges.
 
     Examples
     --------
@@ -246,7 +253,8 @@ def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissuePr
     rng = np.random.default_rng([seed, 0x7469])
     drawn = {}
     for name, (deviation, of_logarithm) in _TISSUE_DEVIATIONS.items():
-        step = deviation * float(np.clip(rng.standard_normal(), -MAX_DEVIATIONS, MAX_DEVIATIONS))
+        drawn_deviations = np.clip(rng.standard_normal(), -MAX_DEVIATIONS, MAX_DEVIATIONS)
+        step = spread * deviation * float(drawn_deviations)
         value = getattr(typical, name)
         value = value * exp(step) if of_logarithm else value + step
         drawn[name] = float(np.clip(value, *PROPERTY_RANGES[name]))

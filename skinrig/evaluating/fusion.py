@@ -1,5 +1,6 @@
 """Evaluate fused maps, and those of single rigs on the same texels, against ground truth."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -11,6 +12,8 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.contents import intersect_valid
 from skinrig.appearances.texel_placement import TexelPlacement
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.fusing.filled_normals import MEASURED_SUFFIX
+from skinrig.fusing.maps import OWN_SUFFIX
 
 MAX_MATCH_DISTANCE_MM: Final = 1.5
 """Maximum distance of a texel from the surface point whose ground truth it is compared with."""
@@ -38,6 +41,11 @@ class FusionAccuracy:
         Median error of the logarithm.
     fused_coverage, single_coverage
         Fraction of true values in the 68 % interval.
+    own_coverage
+        Fraction of the fusion's errors less their median over the face within the standard errors
+        of texels alone; NaN without such a map.
+    common_sigmas
+        Median error of the fusion over its standard error common to the face; NaN likewise.
     """
 
     quantity: str
@@ -49,6 +57,8 @@ class FusionAccuracy:
     single_bias: float
     fused_coverage: float
     single_coverage: float
+    own_coverage: float = math.nan
+    common_sigmas: float = math.nan
 
 
 def compare_fused(
@@ -78,7 +88,8 @@ def compare_fused(
         near, true = _match(position, truth.maps["position"], truth.maps["r_d"].mask, values)
         for c, channel in enumerate(CHANNEL_NAMES):
             pair = [_flat(one.maps["r_d"], c) for one in (fused, single["dome"])]
-            rows += _row(f"r_d {channel}", "dome", pair, near, true[:, c])
+            own = _own_stderr(fused, "r_d", c)
+            rows += _row(f"r_d {channel}", "dome", pair, near, true[:, c], own)
     if "flash" in single and "flash" in truths and placement is not None:
         truth = truths["flash"]
         known = truth.maps["melanin"].mask & (truth.maps["melanin"].values > 0.0)
@@ -92,8 +103,75 @@ def compare_fused(
             errors = np.zeros_like(one.values) if one.stderr is None else one.stderr
             stderr, _ = placement.sample(errors, one.mask)
             both = sampled.reshape(-1), stderr.reshape(-1), seen.reshape(-1)
-            rows += _row(name, "flash", [_flat(fused.maps[name], None), both], near, true[:, k])
+            pair = [_flat(fused.maps[name], None), both]
+            rows += _row(name, "flash", pair, near, true[:, k], _own_stderr(fused, name, None))
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class FilledAccuracy:
+    """Accuracy of a quantity on texels without a measurement, which the fusion filled.
+
+    Attributes
+    ----------
+    quantity
+        Map, with its channel.
+    share
+        Filled texels over all of the map.
+    texels
+        Number of filled texels with a ground truth.
+    error
+        Median absolute error of the logarithm.
+    coverage
+        Fraction of true values in the 68 % interval.
+    """
+
+    quantity: str
+    share: float
+    texels: int
+    error: float
+    coverage: float
+
+
+def compare_filled(
+    fused: SkinAppearance, truths: Mapping[str, SkinAppearance]
+) -> list[FilledAccuracy]:
+    """Compare filled texels of R_d, melanin and blood with the ground truth.
+
+    Parameters
+    ----------
+    fused, truths
+        As of `compare_fused`.
+    """
+    rows = []
+    for name in ("r_d", *CHROMOPHORE_MAPS):
+        measured = fused.maps.get(f"{name}{MEASURED_SUFFIX}")
+        if measured is None:
+            continue
+        truth = truths["dome" if name == "r_d" else "flash"]
+        place = truth.maps["position" if name == "r_d" else "position_mm"]
+        true_map = truth.maps[name]
+        flat = true_map.values.reshape(*true_map.mask.shape, -1).astype(np.float64)
+        known = true_map.mask & (flat > 0.0).all(axis=-1)
+        near, true = _match(fused.maps["position"], place, known, flat)
+        filled = near & (measured.values.reshape(-1) == 0.0) & measured.mask.reshape(-1)
+        if (count := int(filled.sum())) < MIN_TEXELS:
+            continue
+        share = float(np.mean(measured.values[measured.mask] == 0.0))
+        for c in range(true.shape[1]):
+            values, stderr, _ = _flat(fused.maps[name], c if true.shape[1] > 1 else None)
+            off = np.abs(values - true[:, c])[filled]
+            error = float(np.median(np.abs(np.log(values[filled] / true[filled, c]))))
+            held = float(np.mean(off <= stderr[filled]))
+            label = f"{name} {CHANNEL_NAMES[c]}" if true.shape[1] > 1 else name
+            rows.append(FilledAccuracy(label, share, count, error, held))
+    return rows
+
+
+def _own_stderr(fused: SkinAppearance, name: str, channel: int | None) -> Float64Array | None:
+    """Return standard errors of texels alone, (N,); None without a map of them."""
+    found = fused.maps.get(f"{name}{OWN_SUFFIX}")
+    return None if found is None else _flat(found, channel)[0]
 
 
 _Flat = tuple[Float64Array, Float64Array, BoolArray]
@@ -121,7 +199,12 @@ def _match(
 
 
 def _row(
-    quantity: str, rig: str, pair: list[_Flat], near: BoolArray, true: Float64Array
+    quantity: str,
+    rig: str,
+    pair: list[_Flat],
+    near: BoolArray,
+    true: Float64Array,
+    own_stderr: Float64Array | None,
 ) -> list[FusionAccuracy]:
     """Return the accuracy of both estimates on the texels where both are valid."""
     chosen = near & (true > 0.0)
@@ -136,5 +219,13 @@ def _row(
         inside = np.abs(values - true)[chosen] <= stderr[chosen]
         figures.append((np.median(np.abs(error)), np.median(error), inside.mean()))
     (fused, fused_bias, fused_held), (single, bias, held) = figures
-    numbers = fused, single, fused_bias, bias, fused_held, held
+    numbers = [fused, single, fused_bias, bias, fused_held, held]
+    if own_stderr is not None:
+        values, stderr, _ = pair[0]
+        own = own_stderr[chosen] / values[chosen]
+        error = np.log(values[chosen] / true[chosen])
+        common = np.square(stderr[chosen] / values[chosen]) - np.square(own)
+        typical = math.sqrt(max(float(np.median(common)), 1e-12))
+        contrast = np.abs(error - np.median(error)) <= own
+        numbers += [float(contrast.mean()), float(np.median(error)) / typical]
     return [FusionAccuracy(quantity, rig, count, *(float(number) for number in numbers))]

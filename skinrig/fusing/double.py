@@ -30,6 +30,7 @@ from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.fitting import probe_sites
 from skinrig.fusing.description import describe_checks, describe_patch, describe_person
 from skinrig.fusing.filled_normals import MEASURED_SUFFIX, fill_normals
+from skinrig.fusing.filled_skin import fill_skin
 from skinrig.fusing.maps import FUSED_MAPS, estimate_maps
 from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
@@ -45,7 +46,8 @@ QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
 }
 """Quantity of a rig in the name of a contradiction."""
 FUSION_FILE: Final = "fusion.json"
-"""Common properties, rigs behind each map and agreement of the rigs, as in `parameters`."""
+"""Common properties, rigs behind each map and agreement of the rigs, as in `parameters`, which
+exports lack."""
 ALBEDO_MAP: Final = "r_d"
 COVARIANCE_NAME: Final = "covariance"
 MAP_RIGS: Final[Mapping[str, str]] = {
@@ -183,6 +185,7 @@ def fuse_sources(
     carried = [name for name in maps if name not in FUSED_MAPS]
     position = base.appearance.maps.get("position")
     fused, p_value = estimate_maps(measured, person, errors, position=position, progress=report)
+    fused = fill_skin(fused, position)
     maps = {name: maps[name] for name in carried}
     if position is not None:
         for name in [name for name in NORMAL_MAPS if name in maps]:
@@ -232,7 +235,6 @@ def fuse_sources(
         parameters["parts"] = parts
     if patch is not None:
         parameters[FUSION_KEY]["patch"] = describe_patch(patch)
-    # exports carry files, not parameters
     files[FUSION_FILE] = json.dumps(parameters[FUSION_KEY], indent=1).encode()
     appearance = derive_appearance(
         *(one.appearance for one in sources.by_rig.values()),

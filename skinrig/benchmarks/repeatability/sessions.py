@@ -13,7 +13,7 @@ from skinrig.planning.confirmation import calibrate_simulated
 from skinrig.simulating.simulation import simulate_session
 
 RIG_SEED: Final = 0
-"""Seed of the rig as built, and of the person where the rig has no other."""
+"""Seed of the benchmark's rigs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +30,8 @@ class RigProtocol:
     """Kinds of calibration, each with its targets."""
     options: Mapping[str, Any]
     """Options of the subject's session."""
+    seed: int = RIG_SEED
+    """Seed of the rig as built, and of the person where the rig has no other."""
 
 
 def choose_protocol(rig: str, *, width_px: int) -> RigProtocol:
@@ -107,7 +109,7 @@ class RigDay:
         folder.mkdir(parents=True)
         day = {"session_seed": seed, "days_ago": days_ago}
         targets = {name: {**how, **day} for name, how in protocol.targets.items()}
-        calibrate_simulated(protocol.rig, folder, targets, protocol.kinds, seed=RIG_SEED)
+        calibrate_simulated(protocol.rig, folder, targets, protocol.kinds, seed=protocol.seed)
         return RigDay(protocol, folder, days_ago)
 
     def capture(
@@ -134,7 +136,7 @@ class RigDay:
         for path in (self.folder / "session-person", *self.folder.glob("truth-*")):
             shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(self.folder / "maps", ignore_errors=True)
-        options = {"seed": RIG_SEED, **self.protocol.options, **person}
+        options = {"seed": self.protocol.seed, **self.protocol.options, **person}
         if self.protocol.rig in ("flash", "dome"):
             options["states"] = (state,)
         done = simulate_session(

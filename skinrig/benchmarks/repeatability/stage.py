@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from capture.calibration import store as calibrations
+from capture.calibration.validity import CalibrationDrift as NumberDrift
 from model.skin import SkinAppearance
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.repeatability.sessions import RigDay, RigProtocol, choose_protocol
@@ -27,7 +28,7 @@ from skinrig.evaluating.session_agreement import SessionError, compare_sessions,
 
 DAYS_AGO: Final = (30, 0)
 """Days of the two sessions, before today."""
-AGES_DAYS: Final = (90, 365)
+AGES_DAYS: Final = (1, 90, 365)
 """Ages at which calibrations are compared with today's."""
 SKIN_PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
 PATCH_SITES: Final = ("forehead", "cheek", "chin")
@@ -82,6 +83,8 @@ class CalibrationDrift:
     """Change of each quantity with an uncertainty, in combined standard uncertainties."""
     relative: float
     """Median relative change of quantities other than 0; 0 without any."""
+    moved: tuple[NumberDrift, ...] = ()
+    """All changes."""
 
     @classmethod
     def between(cls, kind: str, old: RigDay, new: RigDay, *, days: int) -> CalibrationDrift:
@@ -90,7 +93,7 @@ class CalibrationDrift:
         moved = calibrations.measure_drift(*pair)
         sigmas = np.array([one.sigmas for one in moved if one.sigmas is not None])
         relative = [abs(one.change / one.old) for one in moved if one.old]
-        return cls(kind, days, sigmas, float(np.median(relative)) if relative else 0.0)
+        return cls(kind, days, sigmas, float(np.median(relative)) if relative else 0.0, moved)
 
 
 @dataclass(slots=True)
@@ -227,7 +230,7 @@ def measure_repeatability(stage: BenchmarkStage) -> Iterator[None]:
                 stage.add(knobs, timing, gaussian_rms(ratios), extra)
             alarms, pairs = alarms + trials.false_alarms, pairs + trials.pairs
             found, changed = found + trials.found, changed + trials.changed
-            if rig in ("dome", "gradient"):
+            if not stage.toy:
                 trials.drifts += measure_drifts(Path(name) / "drift", protocol, AGES_DAYS)
             for drift in (one for one in trials.drifts if one.sigmas.size):
                 knobs = {"rig": rig, "quantity": f"{drift.kind} calibration, {drift.days} days old"}

@@ -5,14 +5,17 @@ scattering; sigma_tr is written to ``extras``.
 
 References
 ----------
-glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_specular.
+glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_specular,
+KHR_materials_variants.
 """
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -20,16 +23,25 @@ import pygltflib
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
+from skinrig.arrays import Float32Array
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import Material, list_expression_omissions
+from skinrig.exporting.materials.expression_normals import (
+    NEUTRAL_VARIANT,
+    VARIANT_NOTE,
+    expression_normals,
+)
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import M_PER_MM, ExportSettings
 from skinrig.exporting.sealing import describe_provenance
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
+VARIANTS_EXTENSION: Final = "KHR_materials_variants"
+N_NEUTRAL_TEXTURES: Final = 4
+"""Textures of the neutral material; those of expressions follow."""
 
 
 @dataclass(slots=True)
@@ -110,7 +122,8 @@ def write(
             f"--mesh: got tiles {', '.join(map(str, material.tiles))}, expected tile 1001, as glTF "
             "has one; export to mtlx or usd, or give another mesh"
         )
-    (folder / GLB_FILE).write_bytes(encode_glb(material, describe_provenance(appearance)))
+    variants = expression_normals(appearance, material)
+    (folder / GLB_FILE).write_bytes(encode_glb(material, describe_provenance(appearance), variants))
     script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery, appearance)
@@ -127,11 +140,11 @@ def write(
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports have 16",
             "morph_targets": list(material.shapes),
+            "variants": dict.fromkeys(variants, VARIANT_NOTE),
         },
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
     left_out = material.list_mesh_omissions(delivery)
-    left_out += list_expression_omissions(appearance)
     left_out.append(("subsurface light", f"not part of glTF: {in_blender}"))
     if not material.shapes:
         left_out.append(
@@ -140,7 +153,11 @@ def write(
     return left_out
 
 
-def encode_glb(material: Material, provenance: Mapping[str, Any]) -> bytes:
+def encode_glb(
+    material: Material,
+    provenance: Mapping[str, Any],
+    variants: Mapping[str, Float32Array] = MappingProxyType({}),
+) -> bytes:
     """Encode a material with its mesh as the bytes of a .glb file.
 
     Parameters
@@ -149,6 +166,8 @@ def encode_glb(material: Material, provenance: Mapping[str, Any]) -> bytes:
         Material with lengths in mm.
     provenance
         Source, inputs, versions, assumptions and consent, for the file's ``asset.extras``.
+    variants
+        Tangent-space normals by expression, as variants of the material.
     """
     mesh = material.mesh
     skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
@@ -176,10 +195,12 @@ def encode_glb(material: Material, provenance: Mapping[str, Any]) -> bytes:
     surface = pygltflib.Primitive(
         attributes=attributes, indices=indices, material=0, targets=targets
     )
+    if variants:
+        _add_variants(file, surface, list(variants))
     extras = {"targetNames": list(material.shapes)} if targets else {}
     named: dict[str, Any] = {"name": "skin", "extras": extras}
     file.meshes = [pygltflib.Mesh(primitives=[surface], weights=[0.0] * len(targets), **named)]
-    for source, (name, data) in enumerate(_pictures(material)):
+    for source, (name, data) in enumerate(_pictures(material, variants)):
         file.images.append(
             pygltflib.Image(mimeType="image/png", bufferView=binary.view(data), name=name)
         )
@@ -190,7 +211,22 @@ def encode_glb(material: Material, provenance: Mapping[str, Any]) -> bytes:
     return b"".join(file.save_to_bytes())
 
 
-def _pictures(material: Material) -> list[tuple[str, bytes]]:
+def _add_variants(file: pygltflib.GLTF2, surface: pygltflib.Primitive, names: list[str]) -> None:
+    """Add one material per expression, with the normal texture after the neutral textures."""
+    neutral = file.materials[0]
+    for number, name in enumerate(names):
+        own = copy.deepcopy(neutral)
+        own.name = f"{neutral.name}, {name}"
+        own.normalTexture.index = N_NEUTRAL_TEXTURES + number
+        file.materials.append(own)
+    every = [NEUTRAL_VARIANT, *names]
+    mappings = [{"material": k, "variants": [k]} for k in range(len(every))]
+    surface.extensions = {VARIANTS_EXTENSION: {"mappings": mappings}}
+    file.extensions = {VARIANTS_EXTENSION: {"variants": [{"name": name} for name in every]}}
+    file.extensionsUsed = [*file.extensionsUsed, VARIANTS_EXTENSION]
+
+
+def _pictures(material: Material, variants: Mapping[str, Float32Array]) -> list[tuple[str, bytes]]:
     """Return names and 8-bit PNG files of the textures, in the order of their indices."""
 
     def codes(name: str) -> NDArray[Any]:
@@ -204,4 +240,7 @@ def _pictures(material: Material) -> list[tuple[str, bytes]]:
         "normal": codes("normal"),
         "specular in A": np.stack([white, white, white, weight], axis=-1),
     }
+    for name, normals in variants.items():
+        one = material.normal_image("normal", normals, ExportSettings())
+        pictures[f"normal, {name}"] = encode_png_codes(one, depth=8)[0]
     return [(name, png.encode(image, quick=True)) for name, image in pictures.items()]

@@ -249,12 +249,7 @@ class Material:
             Direction of the normals' green.
         """
         if name == "normal":
-            what = f"tangent space of the mesh's vertex frames, {delivery.green_direction}"
-            what = f"{what}, x and y and z in -1 to 1"
-            up = (0.0, 0.0, 1.0)
-            return ExportImage.from_normals(
-                name, self.normals, delivery, what, valid=self.valid, filler=up
-            )
+            return self.normal_image(name, self.normals, delivery)
         # values, unit, color space, and the value of the PNG code 65535
         simple: dict[str, tuple[Float32Array, str, str, float]] = {
             "base_color": (self.base_color, "1", SRGB_SPACE, 1.0),
@@ -271,6 +266,25 @@ class Material:
             what = f"{what}; {COLOR_NOTE}"
         valid, filler = (None, (0.0,)) if name == "mask" else (self.valid, None)
         return ExportImage(name, values, unit, space, what, 0.0, high, valid, filler)
+
+    def normal_image(
+        self, name: str, normals: Float32Array, delivery: ExportSettings
+    ) -> ExportImage:
+        """Return a texture of normals in the mesh's tangent frames.
+
+        Parameters
+        ----------
+        name
+            Name of the texture.
+        normals
+            (H, W, 3), unit, +Y up.
+        delivery
+            Direction of the normals' green.
+        """
+        what = f"tangent space of the mesh's vertex frames, {delivery.green_direction}"
+        what = f"{what}, x and y and z in -1 to 1"
+        up = (0.0, 0.0, 1.0)
+        return ExportImage.from_normals(name, normals, delivery, what, valid=self.valid, filler=up)
 
     def error_images(self) -> list[ExportImage]:
         """Return images of the available standard uncertainties, and of the mask."""
@@ -321,5 +335,8 @@ def list_expression_omissions(appearance: SkinAppearance) -> list[tuple[str, str
     """
     if WRINKLES not in describe_parts(appearance):
         return []
-    why = "the material is that of the neutral face; --to metahuman writes their maps and masks"
+    why = (
+        "the material is that of the neutral face; --to gltf and usd have a variant per "
+        "expression, --to metahuman their maps and masks"
+    )
     return [("wrinkles of expressions", why)]

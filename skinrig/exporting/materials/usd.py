@@ -20,7 +20,8 @@ from skinrig.drawing import templates
 from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
-from skinrig.exporting.materials.material import Material, list_expression_omissions
+from skinrig.exporting.materials.expression_normals import VARIANT_NOTE, expression_normals
+from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import METERS_PER_UNIT, ExportSettings
 from skinrig.exporting.sealing import PROVENANCE_KEY, format_provenance
 
@@ -62,15 +63,18 @@ def write(
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
     tiles = material.list_mesh_omissions(delivery)
-    tiles += list_expression_omissions(appearance)
     out = ImageFolder(folder, delivery, appearance, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.write_png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
+    variants = {}
+    for name, normals in expression_normals(appearance, material).items():
+        variants[name] = f"normal_{name}"
+        image = material.normal_image(variants[name], normals, delivery)
+        out.write_png(image, materialx.TEXTURE_FOLDER)
     names = {name: Tf.MakeValidIdentifier(name) for name in material.shapes}
     radius = scale * delivery.units_per_mm
-    _write_stage(
-        folder / USD_FILE, material, names, radius, delivery, format_provenance(appearance)
-    )
+    provenance = format_provenance(appearance)
+    _write_stage(folder / USD_FILE, material, names, variants, radius, delivery, provenance)
     textures = (
         ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
         # Blender's level of 0.5 is the reflection of a dielectric
@@ -79,7 +83,10 @@ def write(
     script = blender.Import(USD_FILE, scale, None, textures).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     facts = materialx.describe_material(material, appearance, delivery, SCHEMA, scale)
-    out.document(DOCUMENT_FILE, {**facts, "blend_shapes": names})
+    out.document(
+        DOCUMENT_FILE,
+        {**facts, "blend_shapes": names, "variants": dict.fromkeys(variants, VARIANT_NOTE)},
+    )
     what = "subsurface scattering and specular weight of UsdPreviewSurface"
     in_blender = f"the mtlx network has both; {blender.SCRIPT_FILE} sets them"
     left_out = [*tiles, (what, f"not part of it: {in_blender}")]
@@ -92,11 +99,12 @@ def _write_stage(
     path: Path,
     material: Material,
     names: Mapping[str, str],
+    variants: Mapping[str, str],
     radius: float,
     delivery: ExportSettings,
     provenance: str,
 ) -> None:
-    """Write the stage; blend shapes keep their names."""
+    """Write the stage; blend shapes keep their names, and variants have normal maps of a name."""
     from pxr import Sdf, Vt
 
     mesh, per_mm = material.mesh, delivery.units_per_mm
@@ -105,6 +113,7 @@ def _write_stage(
         "exporting/templates/skin.usda",
         unit_m=METERS_PER_UNIT[delivery.scene_unit],
         shapes=list(names.values()),
+        variants=variants,
         sigma_tr=material.sigma_tr(),
         materialx=materialx.MATERIALX_FILE,
         linear_srgb=materialx.LINEAR_SRGB_NAME,

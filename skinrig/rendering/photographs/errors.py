@@ -81,6 +81,9 @@ class PairErrors:
         Sum of |rendering - photograph| over all skin, relative to that of the photograph.
     ssim
         Mean structural similarity of the tone-mapped pair over the skin, -1 to 1.
+    delta_e
+        Mean color difference CIEDE2000 of the tone-mapped pair over the skin, camera RGB taken as
+        linear sRGB.
     """
 
     relative: Float64Array
@@ -89,6 +92,7 @@ class PairErrors:
     noise: float
     total_error: float
     ssim: float
+    delta_e: float
 
     @property
     def median(self) -> float:
@@ -168,7 +172,8 @@ def compare_pair(
     middle = float(np.median(noise)) if chosen.any() else float("nan")
     total = float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30))
     alike = structural_similarity(photograph.rgb, image, skin)
-    return PairErrors(np.abs(signed), signed, chosen, middle, total, alike)
+    difference = color_difference(photograph.rgb, image, skin)
+    return PairErrors(np.abs(signed), signed, chosen, middle, total, alike, difference)
 
 
 def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
@@ -191,14 +196,36 @@ def structural_similarity(photograph: ArrayLike, rendering: ArrayLike, skin: Boo
     """
     from skimage.metrics import structural_similarity
 
-    light = luminance(photograph)[skin]
-    white = max(float(np.percentile(light, WHITE_PERCENTILE)), 1e-30)
-    pair = [tone_map(image, white) * skin[..., None] for image in (photograph, rendering)]
+    pair = [image * skin[..., None] for image in _tone_map_pair(photograph, rendering, skin)]
     if min(skin.shape) < 11:
         raise RenderingError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
     windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     _, full = structural_similarity(*pair, data_range=1.0, channel_axis=-1, full=True, **windows)
     return float(np.mean(np.asarray(full)[skin]))
+
+
+def color_difference(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
+    """Return the mean CIEDE2000 over the skin of a tone-mapped pair, as of `PairErrors`.
+
+    Examples
+    --------
+    >>> gray = np.full((4, 4, 3), 0.5)
+    >>> [round(color_difference(gray, f * gray, np.ones((4, 4), bool)), 2) for f in (1.0, 0.98)]
+    [0.0, 0.45]
+    """
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    pair = _tone_map_pair(photograph, rendering, skin)
+    return float(np.mean(deltaE_ciede2000(*(rgb2lab(image[skin]) for image in pair))))
+
+
+def _tone_map_pair(
+    photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray
+) -> tuple[Float64Array, Float64Array]:
+    """Return both as sRGB codes, 0 to 1; `WHITE_PERCENTILE` of the photograph's skin is 1."""
+    light = luminance(photograph)[skin]
+    white = max(float(np.percentile(light, WHITE_PERCENTILE)), 1e-30)
+    return tone_map(photograph, white), tone_map(rendering, white)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +244,7 @@ class Summary:
         Median of the signed error.
     noise
         Median relative error by noise alone, mean over the photographs.
-    total_error, ssim
+    total_error, ssim, delta_e
         Means over the photographs, see `PairErrors`.
     """
 
@@ -232,6 +259,7 @@ class Summary:
     noise: float
     total_error: float
     ssim: float
+    delta_e: float
 
 
 def summarize_pairs(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
@@ -267,6 +295,7 @@ def summarize_pairs(pairs: Sequence[PairErrors], *, rng: np.random.Generator) ->
         noise=float(np.mean([pair.noise for pair in pairs if pair.lit.any()])),
         total_error=float(np.mean([pair.total_error for pair in pairs])),
         ssim=float(np.mean([pair.ssim for pair in pairs])),
+        delta_e=float(np.mean([pair.delta_e for pair in pairs])),
     )
 
 
@@ -376,9 +405,15 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
     shares = ("median", "p68", "p95", "bias", "total_error")
     console.print_table(
-        ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
+        (
+            *("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %"),
+            *("SSIM", "Delta E"),
+        ),
         [
-            (name, row["pairs"], *(round(100 * row[k], 2) for k in shares), round(row["ssim"], 4))
+            (
+                *(name, row["pairs"], *(round(100 * row[k], 2) for k in shares)),
+                *(round(row["ssim"], 4), round(row["delta_e"], 3)),
+            )
             for name, row in rows.items()
         ],
     )

@@ -179,7 +179,10 @@ def evaluate_photographs(
         if pair.lit.any():
             kinds.setdefault(shot.held_out, []).append(pair)
         bands.append(_bands(whole, made))
-        figures = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
+        figures = {
+            name: getattr(pair, name)
+            for name in ("median", "noise", "ssim", "delta_e", "total_error")
+        }
         lit = int(np.count_nonzero(pair.lit))
         rows.append({**dataclasses.asdict(shot), **figures, "lit_pixels": lit})
         for name, image in surface.render_ablations(made, shot, fewer) if settings.ablation else ():

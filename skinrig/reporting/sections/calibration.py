@@ -4,6 +4,7 @@ import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -92,7 +93,7 @@ def section(
             try:
                 found = store.load(folder, path.stem)
             except (CalibrationError, ValueError) as error:
-                ages.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
+                ages.append((f"{folder.name}, {path.stem}", "", "", "", "", "", "", str(error)))
                 left.append(float("nan"))
                 continue
             days, row = _age(folder.name, path, found, appearances, sessions)
@@ -158,8 +159,56 @@ def _age(
         ", ".join(users) or "not used",
         ", ".join(day.isoformat() for day in captured),
         ", ".join(map(str, ages)),
+        describe_drift(found.rig, found.kind, max(*ages, 0)) if ages else "",
         f"{verdict}; {found.source}",
     )
+
+
+@cache
+def _drifts() -> list[tuple[str, str, int, float, float]]:
+    """Return rig, kind, age in days, rms change in standard errors or 0, and median change in %."""
+    text = resources.files("skinrig").joinpath("data/calibration_drift.csv").read_text()
+    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    return [
+        (
+            row["rig"],
+            row["kind"],
+            int(row["days"]),
+            float(row["sigmas"] or 0.0),
+            float(row["percent"]),
+        )
+        for row in rows
+    ]
+
+
+def describe_drift(rig: str, kind: str, age_days: int) -> str:
+    """Return how far calibrations of simulated rigs have moved at an age, in words.
+
+    Parameters
+    ----------
+    rig, kind
+        Of the calibration.
+    age_days
+        At capture, >= 0; that of the next longer measured age is given, or of the longest.
+
+    Returns
+    -------
+    str
+        Empty for kinds that were not measured.
+
+    Examples
+    --------
+    >>> describe_drift("dome", "lights", 400).endswith("at 365 days")
+    True
+    >>> describe_drift("flash", "color", 3)
+    ''
+    """
+    ages = sorted(row[2:] for row in _drifts() if row[:2] == (rig, kind))
+    if not ages:
+        return ""
+    days, sigmas, percent = next((row for row in ages if row[0] >= age_days), ages[-1])
+    spread = f", {sigmas:g} standard errors" if sigmas else ""
+    return f"{percent:g} %{spread} at {days} days"
 
 
 def count_days_left(found: Calibration, day: date) -> int:

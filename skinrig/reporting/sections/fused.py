@@ -8,6 +8,7 @@ import numpy as np
 
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import FUSION_KEY
+from skinrig.fusing.filled_normals import MEASURED_SUFFIX
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import map_title
 
@@ -16,14 +17,18 @@ DRAWN_OF_ONE_RIG = ("position", "normals_refined", "translucency")
 
 
 def without_copies(appearance: SkinAppearance) -> SkinAppearance:
-    """Return a fused person without maps that one rig's section draws as well."""
+    """Return a fused person without maps that one rig's section draws, and measured texels."""
     found: Any = appearance.parameters[FUSION_KEY]
     copies = {
         name
         for name, rigs in found["maps"].items()
         if len(rigs) == 1 and name not in DRAWN_OF_ONE_RIG and not name.startswith("patch_")
     }
-    maps = {name: one for name, one in appearance.maps.items() if name not in copies}
+    maps = {
+        name: one
+        for name, one in appearance.maps.items()
+        if name not in copies and not name.endswith(MEASURED_SUFFIX)
+    }
     return replace(appearance, maps=maps)
 
 

@@ -264,7 +264,8 @@ def test_properties_of_the_tissue_reach_every_rig(person):
 def test_impossible_tissue_is_refused_by_name(person):
     with pytest.raises(SubjectFileError) as caught:
         read_subject_file(person('tissue_model = "wax"\nepidermis_mm = 3.0'))
-    assert "tissue_model: got 'wax', expected one of drawn, typical, papers" in str(caught.value)
+    known = "drawn, published, typical, papers"
+    assert f"tissue_model: got 'wax', expected one of {known}" in str(caught.value)
     assert "epidermis_mm: got 3.0, expected 0.03 to 0.4" in str(caught.value)
 
 

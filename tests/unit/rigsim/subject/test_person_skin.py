@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from model import skin_tone
+from model.tissue_optics.uncertainty import NUISANCE_PARAMETERS
 from rigsim.fiber.probe_tissue import TissueError
-from rigsim.population.files import load_subject, load_tissue
+from rigsim.population.files import SubjectFile, load_subject, load_tissue
 from rigsim.population.population import draw_population, get_member
 from rigsim.population.textures import SubjectFileError
 from rigsim.subject.face_regions import from_mean_head
@@ -130,6 +131,17 @@ def test_tone_is_exact_for_any_thickness(seed):
     tissue = draw_tissue(seed)
     assert typology_angle_deg(melanin_of_tone("ita:27", tissue), tissue) == pytest.approx(27.0)
     assert typology_angle_deg(melanin_of_tone("ita:27"), tissue) != pytest.approx(27.0, abs=0.02)
+
+
+@pytest.mark.parametrize("property_", NUISANCE_PARAMETERS[1:], ids=lambda one: one.name)
+def test_published_people_fill_published_ranges(property_):
+    name = {"baseline_factor": "baseline_amplitude"}.get(property_.name, property_.name)
+    skins = [SubjectFile(tissue_model=model) for model in ("published", "drawn")]
+    values = np.array([[getattr(s.properties(seed=k), name) for k in range(400)] for s in skins])
+    wide, usual = (np.log(values) if property_.is_log else values).std(axis=1)
+    # draws end at two deviations, and fractions at 1, 1.1 deviations above the usual eumelanin
+    assert 0.84 * property_.sd < wide < 1.02 * property_.sd
+    assert usual < 0.45 * property_.sd
 
 
 @pytest.mark.parametrize("angle", [60.0, 27.0, -40.0])

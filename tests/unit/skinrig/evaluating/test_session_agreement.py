@@ -149,7 +149,7 @@ def test_deformed_face_is_found_by_shape():
 
 def patch(seed, shift=0):
     person, rng = np.random.default_rng([seed, 9]), np.random.default_rng([seed, shift, 4])
-    relief = 10.0 * gaussian_filter(person.standard_normal((160, 160)), 2.0)
+    relief = 70.0 * gaussian_filter(person.standard_normal((160, 160)), 2.0)
     seen = relief[20:148, 20 + shift : 148 + shift] + 0.1 * rng.standard_normal((128, 128))
     stderr = np.full(seen.shape, 0.4)
     return SkinAppearance({"height_a000_n0": SkinMap(seen, "um", stderr)}, "simulated")

@@ -33,6 +33,17 @@ def test_correct_rendering_differs_by_noise_alone(rng):
     assert pair.ssim > 0.98
 
 
+def test_color_difference_has_its_closed_form():
+    gray, skin = np.full((4, 4, 3), 0.5), np.ones((4, 4), bool)
+    # the photograph is white, L* = 100; of two grays CIEDE2000 is the difference over S_L
+    light = 116.0 * 0.9 ** (1.0 / 3.0) - 16.0
+    off = (0.5 * (100.0 + light) - 50.0) ** 2
+    expected = (100.0 - light) / (1.0 + 0.015 * off / np.sqrt(20.0 + off))
+    assert errors.color_difference(gray, 0.9 * gray, skin) == pytest.approx(expected, rel=1e-3)
+    redder = gray * np.array([1.0, 0.98, 0.98])
+    assert errors.color_difference(gray, redder, skin) > 0.5
+
+
 @pytest.mark.parametrize("factor", [0.9, 1.05, 1.3])
 def test_rendering_too_bright_by_factor_errs_by_factor(rng, factor):
     rgb, photo, covered, lit = scene(rng)

@@ -107,6 +107,7 @@ def test_photograph_check_failing_once_is_reported_as_changed(light, tmp_path):
         "bias": 0.0,
         "total_error": 0.04,
         "ssim": 0.9,
+        "delta_e": 1.0,
         "noise": 0.01,
     }
     for name, median in (("a", 0.03), ("b", 0.08)):

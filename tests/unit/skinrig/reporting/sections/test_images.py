@@ -20,6 +20,7 @@ def a_row(median):
         "bias": -0.01,
         "total_error": 0.04,
         "ssim": 0.98,
+        "delta_e": 1.0,
         "noise": 0.01,
     }
 
