@@ -48,7 +48,7 @@ def analyse_brdf(
         APPEARANCE/ folders of dome sessions with basis BRDFs; none: packaged estimates from
         simulated sessions of people.
     merl_basis
-        Folder of the MERL tables used in the reconstruction; default: built-in materials.
+        Folder of the tables used in the reconstruction; default: built-in materials.
     points
         Texels per face, default 2000. Packaged sessions have up to 300 of the single subject in
         each condition and up to 60 of each person.
