@@ -75,6 +75,7 @@ UNREADABLE = {
     "analyse brdf": ["--out a --labels l.csv"],
     "analyse blood": ["a"],
     "analyse parameterization": ["a"],
+    "analyse relief": ["a --out r"],
     "analyse profile": ["a", "--stretch 1,b --out p"],
     "analyse color-table": ["--size 8", "file.txt --eumelanin-fraction 0.5 --out t"],
     "analyse lumitexel": ["a"],
@@ -194,6 +195,7 @@ UNUSABLE = {
     "analyse albedo": ["none folder --out a"],
     "analyse brdf": ["none folder --out a"],
     "analyse blood": ["none --out a", "folder --out a"],
+    "analyse relief": ["none --moving none --mesh none --out r"],
     "analyse parameterization": ["none --out p", "file.txt --out p", "folder --out p"],
     "analyse profile": [
         "none --out p",
