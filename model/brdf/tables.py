@@ -36,7 +36,7 @@ MIN_STORED_VALUE = 1e-20
 LED_RADIUS_RAD = 10.0 / 700.0
 """Angular radius of the dome's lights (10 mm at 700 mm) from its center."""
 RGL_SUFFIX = ".bsdf"
-SUFFIXES = (".binary", RGL_SUFFIX)
+MATERIAL_SUFFIXES = (".binary", RGL_SUFFIX)
 """Of files of measured BRDFs: MERL and RGL."""
 _HALF_PI = 0.5 * np.pi
 
@@ -180,7 +180,7 @@ def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
     """
     place = Path(folder)
     found = place.iterdir() if place.is_dir() else []
-    return sorted((p for p in found if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
+    return sorted((p for p in found if p.suffix.lower() in MATERIAL_SUFFIXES), key=lambda p: p.name)
 
 
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
@@ -223,23 +223,27 @@ def read_brdf(path: Path) -> Brdf:
     model.merl.MerlFileError, model.brdf.rgl.RglFileError, model.brdf.tensor_file.TensorFileError
         When it is not such a table.
     """
-    if path.suffix.lower() == RGL_SUFFIX:
-        table = rgl.read(path)
-        values = table.values
-
-        def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
-            found = table.evaluate(light, view).mean(axis=-1)
-            return np.where((light[..., 2] > 0.0) & (view[..., 2] > 0.0), found, np.nan)
-
-    else:
-        mean = merl.read_mean(path)
-        values, brdf = mean, merl_brdf(mean)
-    largest = np.nanmax(values, initial=0.0)
+    brdf, largest = _read_rgl(path) if path.suffix.lower() == RGL_SUFFIX else _read_merl(path)
     if not largest > 0.0:
         raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
-    if not largest < np.finfo(np.float32).max:
+    if not largest < float(np.finfo(np.float32).max):
         raise BasisError(f"{path}: got {largest:.3g} 1/sr, expected less than 3e38")
     return brdf
+
+
+def _read_merl(path: Path) -> tuple[Brdf, float]:
+    mean = merl.read_mean(path)
+    return merl_brdf(mean), float(np.nanmax(mean, initial=0.0))
+
+
+def _read_rgl(path: Path) -> tuple[Brdf, float]:
+    table = rgl.read(path)
+
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
+        found = table.evaluate(light, view).mean(axis=-1)
+        return np.where((light[..., 2] > 0.0) & (view[..., 2] > 0.0), found, np.nan)
+
+    return brdf, float(np.nanmax(table.values, initial=0.0))
 
 
 def tabulate_column(brdf: Brdf, light_radius_rad: float) -> Float32Array:

@@ -20,7 +20,7 @@ from rigsim.arrays import Float64Array
 
 METAL_FRACTION = 0.2
 SECOND_LOBE_FRACTION = 0.4
-ROUGHNESS = (0.06, 0.6)
+LOBE_ROUGHNESS = (0.06, 0.6)
 """Roughness alpha of the lobes; drawn evenly in its logarithm."""
 TAIL_EXPONENT = (1.2, 3.0)
 
@@ -55,7 +55,8 @@ def generate_brdf(
     normal_reflectance = rng.uniform(0.3, 0.9, 3) if metal else np.full(3, rng.uniform(0.02, 0.08))
     count = 2 if rng.random() < SECOND_LOBE_FRACTION else 1
     shares = rng.dirichlet(np.full(count, 2.0))
-    alphas = np.exp(rng.uniform(*np.log(ROUGHNESS), count))
+    least, most = np.log(LOBE_ROUGHNESS)
+    alphas = np.exp(rng.uniform(float(least), float(most), count))
     exponents = rng.uniform(*TAIL_EXPONENT, count)
 
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:

@@ -169,7 +169,7 @@ def _draw_windows(
     side = len(height)
     along_u, along_v = atlas.texel_mm()
     texel_um = 1e3 * atlas.typical_texel_mm() * atlas.size / side
-    wanted = 1.05 * MIN_PERIODS * PERIODS_UM[0] / texel_um
+    wanted = 1.25 * MIN_PERIODS * PERIODS_UM[0] / texel_um
     size = int(min(max(wanted, 64.0), MAX_WINDOW_PX, side))
     margin_mm = 1e-3 * texel_um * size * 0.75 + SEAM_FADE_MM
     inner = ndimage.distance_transform_edt(np.pad(atlas.covered, 1))[1:-1, 1:-1]
@@ -203,7 +203,7 @@ def _mean_octaves(
         per_um = np.hypot(
             np.fft.fftfreq(columns, pixel_x)[None], np.fft.fftfreq(rows, pixel_y)[:, None]
         )
-        least = min(rows * pixel_y, columns * pixel_x) / MIN_PERIODS
+        least = np.sqrt(rows * pixel_y * columns * pixel_x) / MIN_PERIODS
         finest = 2.0 * max(pixel_x, pixel_y)
         for k, (longest, shortest) in enumerate(pairwise(PERIODS_UM)):
             if longest <= least * 1.01 and shortest >= finest:

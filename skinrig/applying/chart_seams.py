@@ -131,7 +131,7 @@ def join_charts(height_um: Any, mesh: Mesh, noise: VolumeNoise) -> float:
         away = ndimage.map_coordinates(distance, at, order=1, mode="nearest")
         near = away < start + SEAM_FADE_MM
         part = np.clip((away[near] - start) / SEAM_FADE_MM, 0.0, 1.0) * (0.5 * np.pi)
-        drawn = noise.at(_extrapolate_position(atlas, known, at[0][near], at[1][near]))
+        drawn = noise.at(_extrapolate_position(mesh, atlas, known, at[0][near], at[1][near]))
         band = np.array(height_um[top : top + ROWS_PER_BAND])
         band[near] = np.sin(part) * band[near] + np.cos(part) * drawn
         height_um[top : top + ROWS_PER_BAND] = band
@@ -162,12 +162,22 @@ def _seam_distance_mm(atlas: Atlas, seams: ChartSeams) -> Float64Array:
 
 
 def _extrapolate_position(
-    atlas: Atlas, known: Any, row: Float64Array, column: Float64Array
+    mesh: Mesh, atlas: Atlas, known: Any, row: Float64Array, column: Float64Array
 ) -> Float64Array:
-    """Return the surface point at fractional texels, mm, linear about the nearest covered texel."""
+    """Return the surface point at fractional texels, mm, in the plane of the nearest triangle."""
     limit = atlas.size - 1
     texel = tuple(np.clip(np.rint(at).astype(int), 0, limit) for at in (row, column))
-    source = tuple(index[texel] for index in known)
-    across = ((column - source[1]) / atlas.size)[:, None] * atlas.dp_du_mm[source]
-    upward = ((source[0] - row) / atlas.size)[:, None] * atlas.dp_dv_mm[source]
-    return np.asarray(atlas.position_mm[source] + across + upward, np.float64)
+    triangle = mesh.faces[atlas.prim[tuple(index[texel] for index in known)]]
+    corners = mesh.uv[triangle].astype(np.float64)
+    uv = np.stack([(column + 0.5) / atlas.size, 1.0 - (row + 0.5) / atlas.size], axis=1)
+    a, b, at = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], uv - corners[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = np.where(area == 0.0, np.inf, area)
+    along_a = (at[:, 0] * b[:, 1] - at[:, 1] * b[:, 0]) / area
+    along_b = (a[:, 0] * at[:, 1] - a[:, 1] * at[:, 0]) / area
+    points = mesh.vertices_mm[triangle].astype(np.float64)
+    return np.asarray(
+        points[:, 0]
+        + along_a[:, None] * (points[:, 1] - points[:, 0])
+        + along_b[:, None] * (points[:, 2] - points[:, 0])
+    )

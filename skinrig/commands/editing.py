@@ -219,7 +219,7 @@ def fit_brdf(
         ("grid", "coefficients", "BRDF, 50 %", "90 %", "cube root, 50 %", "90 %"),
         (
             (
-                brdf_tables.GRIDS[row["grid"]],
+                brdf_tables.GRID_LABELS[row["grid"]],
                 row["coefficients"],
                 *percents(row["error"]),
                 *percents(row["cube_root_error"]),

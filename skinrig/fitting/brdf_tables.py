@@ -39,13 +39,13 @@ from skinrig.errors import UnusableError
 OUTPUT_FILES: Final = ("tables.json", "grids.png")
 GRID_NODES: Final = ((8, 4, 2), (16, 8, 4), (32, 16, 8), (90, 32, 12))
 """Nodes along theta_h, theta_d and phi_d of the judged grids; the last is that of the basis."""
-GRIDS: Final = {
+GRID_LABELS: Final = {
     "angles": "even angles",
     "merl": "even square root of theta_h",
     "areas": "even areas: 1 - cos(theta_h), sin^2(theta_d)",
 }
 MIN_TABLES: Final = 3
-PERCENTILES: Final = (50, 90)
+ERROR_PERCENTILES: Final = (50, 90)
 N_SAMPLES: Final = 900
 """Samples of a fit, as many as a point of the dome has; as many others are held out."""
 MAX_FITS: Final = 12
@@ -166,7 +166,7 @@ def fit_tables(
     rng = np.random.default_rng([seed, 2])
     light, view = (_draw_directions(rng, 2 * N_SAMPLES) for _ in range(2))
     grids = _GridProjections()
-    reduced = []
+    reduced: list[ReducedTable] = []
     for name, brdf, table in _each_table(files, total, seed):
         report(f"table {len(reduced) + 1} of {total}: {name}")
         column = tables.tabulate_column(brdf, 0.0)
@@ -178,7 +178,7 @@ def fit_tables(
     mixtures = _mixture_errors(columns, formulas)
     fits = _fit_held_out(reduced, columns, light, view, formulas, rng)
     of_grids = np.stack([one.grid_errors for one in reduced])
-    document = {
+    document: dict[str, Any] = {
         "schema": "skinrig.brdf-tables/1",
         "source": "generated" if folder is None else str(folder),
         "tables": total,
@@ -194,7 +194,7 @@ def fit_tables(
                 "cube_root_error": _percentiles(of_grids[:, 1, place, size]),
             }
             for size in range(len(GRID_NODES))
-            for place, grid in enumerate(GRIDS)
+            for place, grid in enumerate(GRID_LABELS)
         ],
         "each": [
             {"name": name, **{who: float(errors[k]) for who, errors in mixtures.items()}}
@@ -245,7 +245,7 @@ class _GridProjections:
                         _orthonormal_hats(along[grid][0], n_h, self._roots[0]),
                         _orthonormal_hats(along[grid][1], n_d, self._roots[1]),
                     )
-                    for grid in GRIDS
+                    for grid in GRID_LABELS
                 ],
             )
             for n_h, n_d, n_phi in GRID_NODES
@@ -254,7 +254,7 @@ class _GridProjections:
     def errors(self, table: Float64Array) -> Float64Array:
         """Return relative errors (2, grids, sizes) of a table and of its cube root."""
         filled = _fill_from_inside(table)
-        found = np.empty((2, len(GRIDS), len(GRID_NODES)))
+        found = np.empty((2, len(GRID_LABELS), len(GRID_NODES)))
         for row, values in zip(found, (filled, np.cbrt(filled)), strict=True):
             scaled = values * self._roots[0][:, None, None] * self._roots[1][:, None]
             whole = float(np.sum(scaled**2))
@@ -323,18 +323,13 @@ def _fit_held_out(
         brdf = reduced[k].samples
         value = brdf[fitted] * light[fitted, 2]
         error = SAMPLE_NOISE * (value + value.mean())
+        noisy = value + error * rng.standard_normal(len(value))
+        value_of_one, variance, to_light, to_view, normals = (
+            np.asarray(array, np.float32)[None]
+            for array in (noisy, error**2, light[fitted], view[fitted], up)
+        )
         samples = brdf_basis.SurfaceSamples(
-            *(
-                np.asarray(array, np.float32)[None]
-                for array in (
-                    value + error * rng.standard_normal(len(value)),
-                    error**2,
-                    light[fitted],
-                    view[fitted],
-                    up,
-                )
-            ),
-            valid=(value > 0.0)[None],
+            value_of_one, variance, to_light, to_view, normals, (value > 0.0)[None]
         )
         others = tables.basis_from_columns(
             np.delete(columns, k, axis=-1), names[:k] + names[k + 1 :], light_radius_rad=0.0
@@ -354,13 +349,13 @@ def _draw_directions(rng: np.random.Generator, count: int) -> Float64Array:
 
 
 def _percentiles(errors: Float64Array) -> dict[str, float]:
-    return {str(p): float(np.percentile(errors, p)) for p in PERCENTILES}
+    return {str(p): float(np.percentile(errors, p)) for p in ERROR_PERCENTILES}
 
 
 def _draw_grids(rows: list[dict[str, Any]]) -> bytes:
     figure, axes = new_figure(6.4, 3.2, 1, 2)
     for plot, what in zip(axes[0], ("error", "cube_root_error"), strict=True):
-        for grid, label in GRIDS.items():
+        for grid, label in GRID_LABELS.items():
             own = [row for row in rows if row["grid"] == grid]
             errors = [100.0 * row[what]["50"] for row in own]
             counts = [row["coefficients"] for row in own]

@@ -75,13 +75,14 @@ def test_bilinear_samples_of_a_plane_are_exact(rng):
     np.testing.assert_allclose(sample_map(plane, uv), 3.0 * uv[:, 0] - 2.0 * uv[:, 1], atol=1e-12)
 
 
+@pytest.mark.long
 def test_map_without_fading_has_steps_at_seams(moving, tmp_path, monkeypatch):
     mesh = write_sheet(tmp_path / "sheet.npz")
     how = {"moving": moving, "mesh": mesh, "seed": 0}
-    joined = measure_relief(tmp_path / "a", synthesize(moving, mesh, tmp_path / "r", 1024), **how)
+    joined = measure_relief(tmp_path / "a", synthesize(moving, mesh, tmp_path / "r", 2048), **how)
     assert joined["seam"]["99"] <= joined["interior"]["99"]
     monkeypatch.setattr(applying, "join_charts", lambda *given: 0.0)
-    split = measure_relief(tmp_path / "b", synthesize(moving, mesh, tmp_path / "s", 1024), **how)
+    split = measure_relief(tmp_path / "b", synthesize(moving, mesh, tmp_path / "s", 2048), **how)
     assert split["seam"]["99"] > 3.0 * split["interior"]["99"]
     for one in joined["octaves"][1:4]:
         assert abs(one["ratio"] - 1.0) < 0.05 + 2.0 * one["stderr"]

@@ -63,7 +63,7 @@ def test_grid_keeps_what_is_linear_between_its_nodes(rng):
     h = merl.bin_centers()[0]
     grids = brdf_tables._GridProjections()
     at = {"angles": 2.0 * h / np.pi, "merl": np.sqrt(2.0 * h / np.pi), "areas": 1.0 - np.cos(h)}
-    for place, grid in enumerate(brdf_tables.GRIDS):
+    for place, grid in enumerate(brdf_tables.GRID_LABELS):
         nodes = rng.uniform(0.5, 1.0, 8)
         along = np.interp(at[grid], np.linspace(0.0, 1.0, 8), nodes)
         table = np.broadcast_to(along[:, None, None], (90, 90, 180))
