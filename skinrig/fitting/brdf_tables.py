@@ -4,7 +4,8 @@ Tables are read or generated one at a time. Of each remain its column on the gri
 :class:`model.brdf.tables.BrdfBasis`, some samples, and errors of projections to coarser grids.
 
 Errors are relative: RMS of the difference over RMS of the BRDF, where pairs of directions count by
-solid angle, dw_l dw_v = 4 cos(theta_d) dw_h dw_d.
+solid angle, dw_l dw_v = 4 cos(theta_d) dw_h dw_d. Light and view within 3 degrees of the horizon do
+not count: measured tables are unreliable there.
 
 References
 ----------
@@ -286,8 +287,12 @@ def _fill_from_inside(table: Float64Array) -> Float64Array:
 
 def _mixture_errors(columns: Float32Array, formulas: tables.BrdfBasis) -> dict[str, Float64Array]:
     """Return each table's relative distance from mixtures of formulas and of all other tables."""
-    d, _, h = tables.grid_nodes()
-    root = np.sqrt(np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h)))[:, None, :, None]
+    d, phi, h = tables.grid_nodes()
+    at_d, at_phi, at_h = np.meshgrid(d, phi, h, indexing="ij")
+    light, view = merl.to_directions(at_h, at_d, at_phi)
+    known = np.minimum(light[..., 2], view[..., 2]) > MIN_MEASURED_COSINE
+    solid = np.sin(2.0 * at_d) * np.sin(at_h) * np.gradient(h)
+    root = np.sqrt(known * solid)[..., None]
     rows = _as_rows(columns * root)
     size = np.linalg.norm(rows, axis=1)
     rows /= size[:, None]
