@@ -124,6 +124,7 @@ for command in (
 dynamic.fit_app.command("traits", cls=Command)(editing.fit_traits)
 dynamic.fit_app.command("template", cls=Command)(reconstructing.fit_template)
 dynamic.fit_app.command("reflectance", cls=Command)(reconstructing.fit_reflectance)
+dynamic.fit_app.command("brdf", cls=Command)(editing.fit_brdf)
 app.add_typer(simulating.simulate_app, name="simulate")
 app.add_typer(capturing.capture_app, name="capture")
 app.add_typer(capturing.serve_app, name="serve")

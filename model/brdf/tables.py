@@ -24,6 +24,7 @@ from scipy.ndimage import distance_transform_edt
 from model import merl
 from model.arrays import Float32Array, Float64Array
 from model.brdf import recipe as brdf_recipe
+from model.brdf import rgl
 from model.brdf.recipe import Brdf
 from model.checks import Checks
 from model.vectors import unit_vectors
@@ -34,6 +35,9 @@ MIN_STORED_VALUE = 1e-20
 """Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
 LED_RADIUS_RAD = 10.0 / 700.0
 """Angular radius of the dome's lights (10 mm at 700 mm) from its center."""
+RGL_SUFFIX = ".bsdf"
+MATERIAL_SUFFIXES = (".binary", RGL_SUFFIX)
+"""Of files of measured BRDFs: MERL and RGL."""
 _HALF_PI = 0.5 * np.pi
 
 
@@ -167,7 +171,7 @@ def basis_from_columns(
 
 
 def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """Return a folder's .binary files (upper or lower case) by name; none of a missing folder.
+    """Return a folder's MERL and RGL files by name, in any case; none of a missing folder.
 
     Examples
     --------
@@ -176,44 +180,80 @@ def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
     """
     place = Path(folder)
     found = place.iterdir() if place.is_dir() else []
-    return sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
+    return sorted((p for p in found if p.suffix.lower() in MATERIAL_SUFFIXES), key=lambda p: p.name)
 
 
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
-    """Return a basis of the MERL files in a folder, their channels averaged to one.
+    """Return a basis of the MERL and RGL files in a folder, their channels averaged to one.
 
     Parameters
     ----------
     folder
-        Its .binary files (upper or lower case) are read in the order of their names; other files
-        are ignored. One file is in memory at a time.
+        Its .binary and .bsdf files (upper or lower case) are read in the order of their names;
+        other files are ignored. One file is in memory at a time.
     light_radius_rad
         Angular radius of the light to convolve with, rad, in [0, 0.5].
 
     Raises
     ------
     BasisError
-        When the folder is missing or has no .binary file, or one of them has no value above 0.
-    model.merl.MerlFileError
-        When one of them is not a MERL table.
+        When the folder is missing or has no such file, or one of them has no value above 0.
+    model.merl.MerlFileError, model.brdf.rgl.RglFileError, model.brdf.tensor_file.TensorFileError
+        When one of them is not a MERL or RGL table.
     """
     paths = list_material_files(folder)
     if not paths:
-        raise BasisError(f"{folder}: got no .binary files, expected MERL tables; name their folder")
-    columns = [_read_material(path, light_radius_rad) for path in paths]
-    return _pad_table(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
+        raise BasisError(
+            f"{folder}: got no .binary or .bsdf files, expected MERL or RGL tables; "
+            "name their folder"
+        )
+    columns = [tabulate_column(read_brdf(path), light_radius_rad) for path in paths]
+    return basis_from_columns(
+        np.stack(columns, -1), [path.stem for path in paths], light_radius_rad=light_radius_rad
+    )
 
 
-def _read_material(path: Path, light_radius_rad: float) -> Float32Array:
-    mean = merl.read_mean(path)
-    if not np.nanmax(mean, initial=0.0) > 0.0:
+def read_brdf(path: Path) -> Brdf:
+    """Return a MERL or RGL file's BRDF, the mean of its channels; NaN where not measured.
+
+    Raises
+    ------
+    BasisError
+        When it has no value above 0, or one beyond float32.
+    model.merl.MerlFileError, model.brdf.rgl.RglFileError, model.brdf.tensor_file.TensorFileError
+        When it is not such a table.
+    """
+    brdf, largest = _read_rgl(path) if path.suffix.lower() == RGL_SUFFIX else _read_merl(path)
+    if not largest > 0.0:
         raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
-    if not np.nanmax(mean) < np.finfo(np.float32).max:
-        raise BasisError(f"{path}: got {np.nanmax(mean):.3g} 1/sr, expected less than 3e38")
-    return _average_over_light(_nearest_bin(mean), light_radius_rad).astype(np.float32)
+    if not largest < float(np.finfo(np.float32).max):
+        raise BasisError(f"{path}: got {largest:.3g} 1/sr, expected less than 3e38")
+    return brdf
 
 
-def _nearest_bin(mean: Float64Array) -> Brdf:
+def _read_merl(path: Path) -> tuple[Brdf, float]:
+    mean = merl.read_mean(path)
+    return merl_brdf(mean), float(np.nanmax(mean, initial=0.0))
+
+
+def _read_rgl(path: Path) -> tuple[Brdf, float]:
+    table = rgl.read(path)
+
+    def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
+        found = table.evaluate(light, view).mean(axis=-1)
+        return np.where((light[..., 2] > 0.0) & (view[..., 2] > 0.0), found, np.nan)
+
+    return brdf, float(np.nanmax(table.values, initial=0.0))
+
+
+def tabulate_column(brdf: Brdf, light_radius_rad: float) -> Float32Array:
+    """Return a BRDF at the nodes, (32, 12, 90), 1/sr; see `tabulate` and `basis_from_columns`."""
+    return _average_over_light(brdf, light_radius_rad).astype(np.float32)
+
+
+def merl_brdf(mean: Float64Array) -> Brdf:
+    """Return the function that looks up the nearest bin of a table (90, 90, 180), 1/sr."""
+
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
         return np.asarray(mean[merl.bin_indices(np.minimum(h, _HALF_PI), d, phi)])

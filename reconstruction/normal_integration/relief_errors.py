@@ -2,20 +2,29 @@
 
 Interreflection in grooves, occlusion between facets and averaging by the lens are not modeled by
 the estimator. On simulated patches of forehead, cheek and chin (seeds 0 to 5, at rest, with the
-sensor's noise) the errors beyond noise are about the same fraction of the relief on each. The
-fractions below give 68 % regions a coverage of 68 %; ``skinrig bench --stage intervals`` evaluates
-them on other seeds.
+sensor's noise) the errors of normals beyond noise are about the same fraction of the relief on
+each. Errors of heights grow with the slopes, and near holes. The constants below give 68 % regions
+a coverage of 68 %; ``skinrig bench --stage intervals`` evaluates them on other seeds.
 """
 
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_integration.height_filters import SIGMA_PER_CUTOFF
 
-RELATIVE_HEIGHT_ERROR: Final = 0.07
-"""Error of a height over the standard deviation of the relief."""
+HEIGHT_ERROR_UM: Final = 0.42
+"""Error of the height of a flat relief, um, with the gradient rig's pixels of 6 um."""
+HEIGHT_ERROR_PER_SLOPE_UM: Final = 7.5
+"""Error of a height over the variance of one slope, um: steep walls shadow and light each other."""
+HOLE_HEIGHT_ERROR: Final = 0.19
+"""Error of a height at a pixel without a normal, over the standard deviation of the relief."""
+HOLE_REACH_UM: Final = 84.0
+"""Distance from such a pixel at which this error is 1/e of that, um."""
+MAX_SLOPE_VARIANCE: Final = 1.0
+"""Larger variances count as this: such walls are hidden, not measured."""
 RELATIVE_SLOPE_ERROR: Final = 0.055
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
 DIFFUSE_SCALE_MM: Final = 0.15
@@ -25,34 +34,52 @@ RELATIVE_DIFFUSE_ERROR: Final = 0.63
 Set with `DIFFUSE_SCALE_MM` on grooves of six voxel patches (docs/validation/voxel-skin.md)."""
 
 
-def height_stderr(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
+def height_stderr(
+    height: FloatArray, stderr: Float32Array, valid: BoolArray, *, pixel_um: float
+) -> Float32Array:
     """Return standard errors of a relief's heights, of noise and unmodeled effects together.
 
     Parameters
     ----------
     height
-        (H, W), finite where valid; without form longer than the relief.
+        (H, W), um, finite where valid; without form longer than the relief.
     stderr
-        (H, W), of noise alone, in the height's unit.
+        (H, W), of noise alone, um.
     valid
-        (H, W).
+        (H, W); near pixels that are not valid, in grooves that no light or view reaches, errors are
+        larger.
+    pixel_um
+        Side of a pixel, um.
 
     Returns
     -------
     ndarray of float32, shape (H, W)
         At least `stderr`; the same where not valid.
 
+    Notes
+    -----
+    Set on 16 strain steps of three patches (forehead, seeds 0 and 31, cheek, seed 32), so that 68 %
+    intervals cover 60 to 76 % of each; other patches judge it (docs/validation/gradient-rig.md).
+
     Examples
     --------
     >>> known = np.ones((1, 2), bool)
-    >>> found = height_stderr(np.array([[-1.0, 1.0]]), np.zeros((1, 2), np.float32), known)
-    >>> found.astype(float).round(3).tolist()
-    [[0.07, 0.07]]
+    >>> flat = np.zeros((1, 2), np.float32)
+    >>> height_stderr(flat, flat, known, pixel_um=6.0).astype(float).round(3).tolist()
+    [[0.42, 0.42]]
     """
     if not valid.any():
         return stderr
-    model = RELATIVE_HEIGHT_ERROR * float(np.std(height[valid], dtype=np.float64))
-    return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
+    known = np.where(valid, height, np.nan).astype(np.float64)
+    steps = [np.diff(known, axis=axis).ravel() / pixel_um for axis in (0, 1)]
+    variances = [np.var(step[np.isfinite(step)]) for step in steps if np.isfinite(step).any()]
+    slope_variance = min(float(np.mean(variances)) if variances else 0.0, MAX_SLOPE_VARIANCE)
+    model = np.full(valid.shape, HEIGHT_ERROR_UM + HEIGHT_ERROR_PER_SLOPE_UM * slope_variance)
+    if not valid.all():
+        away_um = pixel_um * distance_transform_edt(valid)
+        rms = float(np.std(height[valid], dtype=np.float64))
+        model += HOLE_HEIGHT_ERROR * rms * np.exp(-away_um / HOLE_REACH_UM)
+    return np.where(valid, np.hypot(stderr, model.astype(np.float32)), stderr)
 
 
 def normal_stderr(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:

@@ -36,7 +36,7 @@ class DomeOptions:
     scan: str | Path | None = None
     """PLY mesh of the face in mm that replaces the session's own; None: the session's."""
     basis: str | Path | None = None
-    """Folder of MERL ``.binary`` tables as basis BRDFs; None: the generated dielectrics."""
+    """Folder of MERL and RGL tables as basis BRDFs; None: the generated dielectrics."""
     hold_out: HoldOut | str | None = None
     """Lights and views whose frames are excluded from every fit, as "lights=L007,L023,views=C03"
     or as parsed; `skinrig render --against` compares with them."""
@@ -263,10 +263,10 @@ def _require_some(folder: Path, rig: str) -> None:
 
 
 def _digest_of(folder: Path) -> str:
-    """Hash a folder's MERL tables, names and contents."""
+    """Hash a folder's tables, names and contents."""
     if not folder.is_dir():
         got = f"got {folder}, expected a folder"
-        raise InputsError(f"basis: {got}; give one with MERL .binary files")
+        raise InputsError(f"basis: {got}; give one with .binary or .bsdf files")
     digest = hashlib.sha256()
     for path in list_material_files(folder):
         digest.update(path.name.encode() + b"\0")

@@ -25,6 +25,7 @@ from rigsim.subject.face_regions import region_masks, to_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
+from skinrig.applying.chart_seams import join_charts
 from skinrig.applying.expression import AppliedExpression, ApplyError
 from skinrig.applying.microstructure import apply_microstructure, strain_image
 from skinrig.arrays import Float32Array, Float64Array
@@ -222,9 +223,13 @@ class ReliefEvaluator:
             growing = self.temporary_folder / "displacement_neutral.npy.part"
             neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (asked.size_px,) * 2)
         if asked.source == "noise":
+            if _finest_per_mm(asked.size_px, scale) <= MIN_WAVES_PER_MM:
+                raise ApplyError(
+                    f"--size-px: got {asked.size_px}, which does not resolve 1 mm; enter more"
+                )
             self.progress(f"sample noise at {shape} pixels")
-            rms_um = float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
-            neutral = _noise(self.mesh, asked.size_px, rms_um, scale, rng=rng, out=neutral)
+            noise = _draw_noise(_rms(patches), asked.size_px, scale, rng=rng)
+            neutral = _noise(self.mesh, asked.size_px, noise, out=neutral)
         else:
             self.progress(f"grow the relief of {', '.join(sites)} to {shape}")
             neutral = displacement_synthesis.grow(
@@ -237,6 +242,9 @@ class ReliefEvaluator:
                 patch_pixel_um=float(np.mean(pixels_um)),
                 threads=2,
             )
+            self.progress("join charts of the texture")
+            noise = _draw_noise(_rms(patches), asked.size_px, scale, rng=rng)
+            join_charts(neutral, _face(self.mesh), noise)
         if asked.exceeds_exr:
             neutral.flush()
             os.replace(growing, self.temporary_folder / "displacement_neutral.npy")
@@ -290,21 +298,29 @@ def level_site_patch(
     return level_patch(relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid)
 
 
-def _noise(
-    mesh: BlendShapeMesh,
-    size_px: int,
-    rms_um: float,
-    scale_um: Float64Array,
-    *,
-    rng: np.random.Generator,
-    out: Float32Array | None,
-) -> Float32Array:
-    """Sample noise in space on the mesh's texture, below the pixels' Nyquist frequency."""
-    finest = NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
-    if finest <= MIN_WAVES_PER_MM:
-        raise ApplyError(f"--size-px: got {size_px}, which does not resolve 1 mm; enter more")
+def _rms(patches: Mapping[str, Sequence[Float32Array]]) -> float:
+    """Return the RMS height of the sites' patches together, um."""
+    return float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
+
+
+def _finest_per_mm(size_px: int, scale_um: Float64Array) -> float:
+    """Return the highest spatial frequency of noise on a map's pixels, waves per mm."""
+    return NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
+
+
+def _draw_noise(
+    rms_um: float, size_px: int, scale_um: Float64Array, *, rng: np.random.Generator
+) -> VolumeNoise:
+    """Draw noise in space below the Nyquist frequency of a map's pixels."""
+    finest = max(_finest_per_mm(size_px, scale_um), 1.1 * MIN_WAVES_PER_MM)
     band = (MIN_WAVES_PER_MM, min(finest, MAX_WAVES_PER_MM))
-    noise = VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
+    return VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
+
+
+def _noise(
+    mesh: BlendShapeMesh, size_px: int, noise: VolumeNoise, *, out: Float32Array | None
+) -> Float32Array:
+    """Sample noise in space on the mesh's texture."""
     # positions are smooth: interpolation from a smaller atlas deviates by microns at most
     atlas = unwrap(_face(mesh), POSITION_ATLAS_PX)
     places = dilate_texture(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)

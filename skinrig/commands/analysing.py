@@ -48,7 +48,7 @@ def analyse_brdf(
         APPEARANCE/ folders of dome sessions with basis BRDFs; none: packaged estimates from
         simulated sessions of people.
     merl_basis
-        Folder of the MERL tables used in the reconstruction; default: built-in materials.
+        Folder of the tables used in the reconstruction; default: built-in materials.
     points
         Texels per face, default 2000. Packaged sessions have up to 300 of the single subject in
         each condition and up to 60 of each person.
@@ -302,6 +302,55 @@ def analyse_parameterization(source: Path, /, *, out: Out, json: Json = False) -
     console.print_line(f"{out}: {parameterization.OUTPUT_FILE}")
     figures = {name: value for name, value in found.items() if name != "schema"}
     console.print_document("skinrig.analyse-parameterization/1", {"out": out, **figures})
+
+
+@analyse_app.command("relief", cls=Command)
+@command
+def analyse_relief(
+    relief: Path, /, *, moving: Path, mesh: Path, out: Out, seed: int = 0, json: Json = False
+) -> None:
+    """Measure seams and spectrum of synthesized microrelief against the measured patches.
+
+    Example: skinrig analyse relief relief --moving moving --mesh head.npz --out measured
+
+    Parameters
+    ----------
+    relief
+        Folder written by `skinrig apply microstructure`.
+    moving
+        Folder written by `skinrig fit microstructure`.
+    mesh
+        Mesh that the map belongs to: .npz, OBJ or glTF.
+    seed
+        Random seed of interior samples and windows.
+    """
+    from skinrig.analysing.relief import OUTPUT_FILE, measure_relief
+
+    console = Console(json)
+    found = measure_relief(out, relief, moving=moving, mesh=mesh, seed=seed)
+    console.print_table(
+        ("octave, um", "RMS over the patches'", "standard error", "windows"),
+        (
+            (
+                f"{row['longest_um']:g} to {row['shortest_um']:g}",
+                *(f"{row[key]:.3f}" for key in ("ratio", "stderr")),
+                row["windows"],
+            )
+            for row in found["octaves"]
+        ),
+    )
+    console.print_line(
+        f"neighboring pixels: 99 % differ by {found['interior']['99']:.3f} um or less"
+    )
+    if found["seam"] is None:
+        console.print_line("seams: none")
+    else:
+        half, most = found["seam"].values()
+        length = found["seam_length_mm"]
+        console.print_line(f"seams, {length:.0f} mm: step {half:.3f} um, 99 % up to {most:.3f} um")
+    console.print_line(f"{out}: {OUTPUT_FILE}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-relief/1", {"out": out, **figures})
 
 
 def _rounded(values: dict[str, float]) -> list[str]:

@@ -1,4 +1,4 @@
-"""`skinrig edit`, `skinrig fit traits` and `skinrig analyse albedo`: traits of faces."""
+"""`skinrig edit`, `skinrig fit traits|brdf` and `skinrig analyse albedo`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MerlFolder = Annotated[
     Path | None,
-    option("Folder of the MERL tables used in the reconstruction; default: built-in materials."),
+    option("Folder of the tables used in the reconstruction; default: built-in materials."),
 ]
 LandmarkFolder = Annotated[
     Path | None,
@@ -178,6 +178,58 @@ def fit_traits(
         "rows": [dict(zip(keys, row, strict=True)) for row in found.rows],
     }
     print_fit(console, "traits", out, learned | select_attributes(found, "warnings", "left_out"))
+
+
+@command
+def fit_brdf(
+    tables: Path | None = None, /, *, out: Out, count: int = 100, seed: Seed = 0, json: Json = False
+) -> None:
+    """Fit measured BRDF tables by formulas and by other tables, and judge grids that store them.
+
+    Errors are relative to the RMS of each BRDF. `skinrig reconstruct --merl-basis` fits sessions
+    with the same folder of tables.
+
+    Example: skinrig fit brdf merl-tables --out tables
+
+    Parameters
+    ----------
+    tables
+        Folder of MERL (.binary) and RGL (.bsdf) files; default: generated tables.
+    count
+        Number of generated tables.
+    seed
+        Random seed of generated tables, samples and noise.
+    """
+    from skinrig.fitting import brdf_tables
+
+    console = Console(json)
+    found = brdf_tables.fit_tables(out, tables, count=count, seed=seed, progress=console.progress)
+
+    def percents(errors: dict[str, float]) -> list[str]:
+        return [f"{100.0 * error:.2f} %" for error in errors.values()]
+
+    console.print_table(
+        ("materials of the fit", "whole table, 50 %", "90 %", "held-out samples, 50 %", "90 %"),
+        (
+            (who, *percents(errors), *percents(found["fit_error"][who]))
+            for who, errors in found["mixture_error"].items()
+        ),
+    )
+    console.print_table(
+        ("grid", "coefficients", "BRDF, 50 %", "90 %", "cube root, 50 %", "90 %"),
+        (
+            (
+                brdf_tables.GRID_LABELS[row["grid"]],
+                row["coefficients"],
+                *percents(row["error"]),
+                *percents(row["cube_root_error"]),
+            )
+            for row in found["grids"]
+        ),
+    )
+    console.print_line(f"{found['tables']} tables, {found['fits']} of them fitted from samples")
+    console.print_line(f"{out}: {', '.join(brdf_tables.OUTPUT_FILES)}")
+    print_fit(console, "brdf", out, {k: v for k, v in found.items() if k != "schema"})
 
 
 @command

@@ -93,7 +93,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
     rank
         Number of basis BRDFs of a dome's maps; None: the default number.
     basis
-        Folder of MERL tables; None: the built-in materials.
+        Folder of MERL or RGL tables; None: the built-in materials.
 
     Raises
     ------
@@ -125,7 +125,7 @@ class DomeMapOptions:
     scan
         Face mesh, PLY in mm; default: the session's own scan (dome).
     merl_basis
-        Folder of MERL tables for the basis BRDFs; default: built-in materials (dome).
+        Folder of MERL or RGL tables for the basis BRDFs; default: built-in materials (dome).
     hold_out
         Frames excluded from all fits: lights=L007,L023,views=C03 (dome).
     rank

@@ -407,9 +407,11 @@ def test_topography_model_errors_only_widen_and_scale(seed, scale):
     height = (scale * rng.standard_normal((6, 5))).astype(np.float32)
     stderr = (scale * rng.uniform(0.01, 1.0, (6, 5))).astype(np.float32)
     valid = rng.uniform(size=(6, 5)) > 0.3
-    found = relief_errors.height_stderr(height, stderr, valid)
+    found = relief_errors.height_stderr(height, stderr, valid, pixel_um=6.0)
     assert np.all(found >= stderr)
     np.testing.assert_array_equal(found[~valid], stderr[~valid])
+    whole = relief_errors.height_stderr(height, stderr, np.ones_like(valid), pixel_um=6.0)
+    assert np.isfinite(whole).all()
     normals = rng.standard_normal((6, 5, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     angles = rng.uniform(0.01, 1.0, (6, 5)).astype(np.float32)

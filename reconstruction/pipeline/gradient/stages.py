@@ -47,7 +47,7 @@ from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 _log = logging.getLogger(__name__)
 
-STAGE_REVISION = 11
+STAGE_REVISION = 12
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -341,7 +341,7 @@ def _height(rig: GradientRig, state: SkinState, **made: Any) -> Mapping[str, Any
     found = relief(restored.normals, valid)
     found.convergence.warn_unless_converged(f"height of {state.name}", _log)
     by_noise, slope_noise = _height_noise(restored, found.valid, relief, rig.pixel_um)
-    stderr = relief_errors.height_stderr(found.height, by_noise, found.valid)
+    stderr = relief_errors.height_stderr(found.height, by_noise, found.valid, pixel_um=rig.pixel_um)
     what = (
         "height towards the camera, the lens's blur removed as far as noise allows, without "
         f"wavelengths above {CUTOFF_UM / 1e3:g} mm"
