@@ -33,7 +33,7 @@ from skinrig.planning.time_budget import (
     select_best,
 )
 
-PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
+PRESET_NAMES: Final = ("I", "II", "III", "IV", "V", "VI")
 Person = tuple[str, int]
 """Preset and seed of a simulated subject."""
 
@@ -60,8 +60,9 @@ class EndToEndCase:
 
 CASES: Final[Mapping[str, EndToEndCase]] = {
     "flash": EndToEndCase(
-        tuple(zip(PRESETS, range(621, 627), strict=True)), {256: (30.0, 45.0, 90.0)}
+        tuple(zip(PRESET_NAMES, range(621, 627), strict=True)), {256: (30.0, 45.0, 90.0)}
     ),
+    "gradient": EndToEndCase((("II", 742), ("V", 743)), {128: (21.95, 22.1, 30.0)}),
     "probe": EndToEndCase(
         (("II", 722), ("IV", 723), ("V", 724)), {None: (55.0, 90.0, 160.0)}, by_coverage=True
     ),

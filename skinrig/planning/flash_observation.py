@@ -151,7 +151,7 @@ def estimate_face_bias(
     """
     names = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
     table, prior = load_skin_colors(*names, has_white=True)
-    usable = (colors > MIN_SIGNAL_SIGMAS * noise).all(axis=-1)
+    usable = np.asarray((colors > MIN_SIGNAL_SIGMAS * noise).all(axis=-1), np.bool_)
     rgb = np.where(usable[..., None], colors, np.nan).astype(np.float32)
     variance = np.where(usable[..., None], np.square(noise), 0.0)
     errors = model_error.image_covariance(np.nan_to_num(rgb), variance, usable)

@@ -406,8 +406,6 @@ class ProbeOrder(SimulationOrder):
         SimulationOrder.check(self)
         if self.target is not None:
             self.refuse_options("target of the probe", "sites", "angles")
-        elif self.renderer == "reference":
-            self.refuse_options("probe (renderer reference)", "leave_out")
 
 
 ORDER_BY_RIG: Mapping[str, type[SimulationOrder]] = {

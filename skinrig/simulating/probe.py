@@ -63,6 +63,7 @@ def _build_scene(rig: Rig, plan: Plan, order: ProbeOrder) -> Any:
     if order.renderer != "reference" or order.target is not None:
         photons = TRUTH_PHOTONS[order.size]
         return make_scene(rig, order.target, photons=photons, effects=effects, **given)
+    order.refuse_options("probe (renderer reference)", "leave_out")
     places = {(head.site, head.angle_deg) for head, _ in group_by_series(plan)}
     return reference.make_probe_scene(
         rig, places=places, **given, **select_attributes(order, "size", "progress")
@@ -117,8 +118,9 @@ def make_scene(
         tissue = BLOCK if target == "phantom" else subject_file.load_tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    seeds = {"seed": seed, "noise_seed": noise_seed}
-    return ProbeScene(rig, tissue, **seeds, photons=photons, effects=effects)
+    return ProbeScene(
+        rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons, effects=effects
+    )
 
 
 class HeadLog(SceneLog):

@@ -44,7 +44,7 @@ DOME_PX = 100
 GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 PROBE_SITE = "cheek"
-PRESETS = ("I", "II", "III", "IV", "V", "VI")
+PRESET_NAMES = ("I", "II", "III", "IV", "V", "VI")
 N_PEOPLE = 20
 N_TOY_PEOPLE = 1
 
@@ -155,7 +155,7 @@ def compare_probe(*, toy: bool = False) -> Iterator[EffectComparison]:
         for switch in ("crosstalk", "wings")
     }
     for number in range(1 if toy else N_PEOPLE):
-        preset = PRESETS[number % len(PRESETS)]
+        preset = PRESET_NAMES[number % len(PRESET_NAMES)]
         skin = parse_tissue(preset, seed=number)
         compared = ComparedScene("probe", f"{preset}, seed {number}", ProbeScene(rig, skin))
         yield from _compare_probe_build(compared, bare)
