@@ -93,17 +93,14 @@ def split_into_suctions(seconds: Sequence[float], probe: Probe) -> list[range]:
 
 def suction_overhead_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -> float:
     """Return the time that suction and rests add to a plan's steps with given durations, s."""
-    total, held, group = 0.0, None, list[float]()
-
-    def end_of_group() -> float:
-        count = len(split_into_suctions(group, probe))
-        return count * (PUMP_TIME_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s
-
+    count, held, group = 0, None, list[float]()
     for step, one_s in zip(steps, seconds, strict=True):
         place = step_placement(step) if "suction_mbar" in step.settings else None
         if place != held:
-            total += end_of_group()
+            count += len(split_into_suctions(group, probe))
             held, group = place, []
         if place is not None:
             group.append(one_s)
-    return total + end_of_group()
+    count += len(split_into_suctions(group, probe))
+    # the skin rests between two suctions, also of different placements
+    return count * (PUMP_TIME_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s

@@ -27,11 +27,14 @@ from rigsim.fiber.profile import (
 from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, FiberTable
 
 MAX_KEPT_PROFILES: Final = 64
-"""Number of cached profiles and photon runs."""
+"""Number of cached profiles."""
 
 DIRECTIONS_PER_HALF_TURN: Final = 16
 """Directions over half a turn in which anisotropic tissue is traced; its harmonics up to the 8th
 are so that those between follow from them exactly."""
+
+MAX_SHARED_RUNS: Final = 6
+"""Number of photon runs that are shared by all scenes of a process: two people at three sites."""
 
 SUCTION_STEP_MBAR: Final = 0.1
 """Step to which suction is rounded: within half of it blood differs by less than a 1000th."""
@@ -47,8 +50,16 @@ class BandProfile:
     """Standard error of the Monte Carlo, same shape."""
 
 
+_SHARED_RUNS: LruCache[tuple[object, ...], FiberPaths | BandProfile] = LruCache(
+    lambda _: MAX_SHARED_RUNS
+)
+
+
 class ProfileCache:
     """Profiles of one tissue under one probe.
+
+    A photon run depends on the rig, the optics, the photons and the seed alone. Scenes of one
+    process therefore share it: a forecast and the sessions that confirm it trace photons once.
 
     Parameters
     ----------
@@ -72,12 +83,10 @@ class ProfileCache:
         self.rig, self.tissue = rig, tissue
         self.photons, self.seed, self.threads = photons, seed, threads
         self.probe: Probe = rig.probe
-        most = MAX_KEPT_PROFILES
-        self._runs: LruCache[tuple[object, ...], FiberPaths | BandProfile] = LruCache(
-            lambda _: most
-        )
         self._by_turn: Float64Array | None = None
-        self._profiles: LruCache[tuple[object, ...], BandProfile] = LruCache(lambda _: most)
+        self._profiles: LruCache[tuple[object, ...], BandProfile] = LruCache(
+            lambda _: MAX_KEPT_PROFILES
+        )
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
         """Return the fibers' reflectance at a site.
@@ -133,8 +142,10 @@ class ProfileCache:
         return BandProfile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
 
     def _compute(self, optics: TissueOptics) -> BandProfile:
-        key = (optics.wavelength_nm, optics.stacks)
-        run = self._runs.get(key, lambda: self._trace(optics))
+        absorber = None if optics.absorber is None else optics.absorber.tobytes()
+        own = self.rig, self.photons, self.seed
+        key = (*own, optics.wavelength_nm, optics.stacks, absorber)
+        run = _SHARED_RUNS.get(key, lambda: self._trace(optics))
         if isinstance(run, BandProfile):
             return run
         made = run.profile(optics.amount)

@@ -132,6 +132,12 @@ class SceneEffects:
     """The person's scattering of skin."""
     absorption: bool | None = None
     """The person's baseline absorption, kind of melanin and blood in the epidermis."""
+    crosstalk: bool | None = None
+    """Light of a fiber of the probe that leaves through others."""
+    wings: bool | None = None
+    """Wide wings of the lens's blur around the spots of the probe."""
+    dark_current: bool | None = None
+    """Dark current and hot pixels of the probe's camera."""
     spectral_step: int | None = None
     """Interreflection uses every n-th of the table's wavelengths; None: by the selection's rule."""
     last_bounce: float | None = None

@@ -1,7 +1,8 @@
 """Benchmark of whole captures: error of maps against seconds from the choice of a plan to maps.
 
 For each person, each image width and each budget, `skinrig.planning` chooses a plan. It is captured
-by the simulated rig and reconstructed. Errors and seconds are compared with their forecasts.
+by the simulated rig, with a calibration per person, and reconstructed. Errors and seconds are
+compared with their forecasts.
 """
 
 import math
@@ -11,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +23,9 @@ from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.benchmarks.results import ErrorEstimate, Knob, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.errors import require_choice
 from skinrig.planning.confirmation import calibrate_simulated, capture_choice
-from skinrig.planning.plans import PlanChoice, PlanRequest, load_planner, load_sized_rig
+from skinrig.planning.plans import PlanChoice, PlanRequest, Rehearsal, load_planner, load_sized_rig
 from skinrig.planning.time_budget import (
     RUN_PHASES,
     RunTimes,
@@ -33,6 +33,7 @@ from skinrig.planning.time_budget import (
     select_best,
 )
 
+PRESET_NAMES: Final = ("I", "II", "III", "IV", "V", "VI")
 Person = tuple[str, int]
 """Preset and seed of a simulated subject."""
 
@@ -46,18 +47,28 @@ class EndToEndCase:
     people
         Subjects; none of them set a constant of a forecast.
     budgets_s
-        Budgets from planning to maps, s, by image width, px.
+        Budgets from planning to maps, s, by image width, px; None: the rig's own width.
+    by_coverage
+        Whether the coverage of the forecast's interval is judged instead of its median: one
+        calibration's error is common to all fits of a person.
     """
 
     people: tuple[Person, ...]
-    budgets_s: Mapping[int, tuple[float, ...]]
+    budgets_s: Mapping[int | None, tuple[float, ...]]
+    by_coverage: bool = False
 
 
 CASES: Final[Mapping[str, EndToEndCase]] = {
-    "flash": EndToEndCase((("II", 611), ("V", 614)), {256: (30.0, 45.0, 90.0)})
+    "flash": EndToEndCase(
+        tuple(zip(PRESET_NAMES, range(621, 627), strict=True)), {256: (30.0, 45.0, 90.0)}
+    ),
+    "gradient": EndToEndCase((("II", 742), ("V", 743)), {128: (21.95, 22.1, 30.0)}),
+    "probe": EndToEndCase(
+        (("II", 722), ("IV", 723), ("V", 724)), {None: (55.0, 90.0, 160.0)}, by_coverage=True
+    ),
 }
-CALIBRATION_SEED: Final = 9200
-"""Seed of the noise and the poses of calibration targets."""
+CALIBRATION_SEED: Final = 9210
+"""Seed of the noise and the poses of the first person's calibration targets."""
 TOY_CASE: Final = EndToEndCase((("III", 600),), {64: (30.0, 45.0)})
 
 
@@ -71,12 +82,15 @@ class MeasuredPoint:
         Median errors by map, one per person.
     forecast_s, measured_s
         Seconds of the phases, one per person.
+    inside
+        Whether each map's error is inside the forecast's 68 % interval, one per person.
     """
 
     forecast: list[Mapping[str, float]] = field(default_factory=list)
     measured: list[Mapping[str, float]] = field(default_factory=list)
     forecast_s: list[Mapping[str, float]] = field(default_factory=list)
     measured_s: list[Mapping[str, float]] = field(default_factory=list)
+    inside: list[Mapping[str, bool]] = field(default_factory=list)
 
     def log_error_ratios(self, name: str) -> Float64Array:
         """Return logs of measured over forecast errors of a map, one per person."""
@@ -110,14 +124,19 @@ def measure_end_to_end(stage: BenchmarkStage) -> Iterator[None]:
         cases = {stage.selection: cases[stage.selection]}
     for rig_name, case in cases.items():
         errors: dict[str, list[Float64Array]] = {}
+        inside: dict[str, list[bool]] = {}
         seconds: list[Float64Array] = []
         for (width, budget_s), point in _measure_case(rig_name, case).items():
             seconds.append(point.log_time_ratios())
             for name in point.measured[0]:
                 errors.setdefault(name, []).append(point.log_error_ratios(name))
+                inside.setdefault(name, []).extend(one[name] for one in point.inside)
                 _add_point(stage, rig_name, name, width, budget_s, point)
         for name, logs in errors.items():
-            stage.limits["error", rig_name, name] = spread_ratio(np.concatenate(logs))
+            if case.by_coverage:
+                stage.limits["inside", rig_name, name] = float(np.mean(inside[name]))
+            else:
+                stage.limits["error", rig_name, name] = spread_ratio(np.concatenate(logs))
         stage.limits["seconds", rig_name] = spread_ratio(np.concatenate(seconds))
         yield
 
@@ -127,28 +146,84 @@ def _measure_case(rig_name: str, case: EndToEndCase) -> dict[tuple[int, float], 
     points: dict[tuple[int, float], MeasuredPoint] = {}
     for width, budgets_s in case.budgets_s.items():
         rig = load_sized_rig(rig_name, width)
-        with tempfile.TemporaryDirectory() as name:
-            calibrate_s = _calibrate(rig, Path(name))
-            for person in case.people:
-                for budget_s, measured in _measure_person(
-                    rig, Path(name), person, budgets_s, calibrate_s
-                ):
-                    point = points.setdefault((width, budget_s), MeasuredPoint())
-                    for one, values in zip(
-                        (point.forecast, point.forecast_s, point.measured, point.measured_s),
-                        measured,
-                        strict=True,
-                    ):
-                        one.append(values)
+        for number, person in enumerate(case.people):
+            seed = CALIBRATION_SEED + number
+            for budget_s, choice, found in measure_person(rig, person, budgets_s, seed):
+                key = rig.views[0].width_px, budget_s
+                point = points.setdefault(key, MeasuredPoint())
+                medians = {one: found.errors[one][0] for one in choice.medians}
+                point.forecast.append(choice.medians)
+                point.forecast_s.append(choice.run_times)
+                point.measured.append(medians)
+                point.measured_s.append(found.times.by_phase())
+                point.inside.append(
+                    {
+                        one.name: one.interval[0] <= medians[one.name] <= one.interval[1]
+                        for one in choice.forecasts
+                    }
+                )
     return points
 
 
-def _calibrate(rig: Rig, folder: Path) -> float:
-    """Simulate the targets, calibrate, and return the processor seconds of the calibration."""
+@dataclass(frozen=True, slots=True)
+class MeasuredCapture:
+    """Errors and times from planning to maps of one person."""
+
+    errors: Mapping[str, tuple[float, float]]
+    """Median error, in the unit of the rig's goals, and valid fraction by map."""
+    times: RunTimes
+
+
+def measure_person(
+    rig: Rig, person: Person, budgets_s: Sequence[float], calibration_seed: int
+) -> Iterator[tuple[float, PlanChoice, MeasuredCapture]]:
+    """Yield budget, choice and measurement of a person for each budget that has a plan.
+
+    Parameters
+    ----------
+    rig
+        The rig at the image width of the capture.
+    person
+        Preset and seed of the subject.
+    budgets_s
+        Budgets from planning to maps, s.
+    calibration_seed
+        Seed of noise and poses of the calibration targets.
+    """
+    subject, seed = person
     planner = load_planner(rig.name)
-    whole = PlanChoice(rig, DefaultPlan().of(rig), (), 0.0, {}, ())
-    steps = planner.describe_rehearsal(whole)
-    drawn = {"session_seed": CALIBRATION_SEED}  # others set the constants of forecasts
+    request = PlanRequest(subject=subject, seed=seed, budget_s=max(budgets_s))
+    begun_s = time.process_time()
+    choices = list_choices_within_budget(planner.generate_choices, rig, request)
+    plan_s = time.process_time() - begun_s
+    calibrated: dict[str, tuple[Path, float]] = {}
+    done: dict[str, MeasuredCapture] = {}
+    with tempfile.TemporaryDirectory() as name:
+        for budget_s in budgets_s:
+            within = [one for one in choices if one.run_times["total"] <= budget_s]
+            if not within:
+                continue
+            choice = select_best(within, request.min_valid_fraction)
+            key = str(choice.plan.to_json())
+            if key not in done:
+                steps = planner.describe_rehearsal(choice)
+                used = str(steps.targets)  # those of the dome contain its plan
+                if used not in calibrated:
+                    folder = Path(name) / f"calibrated-{len(calibrated)}"
+                    calibrated[used] = folder, _calibrate(rig, steps, folder, calibration_seed)
+                folder, calibrate_s = calibrated[used]
+                own = Path(name) / f"captured-{len(done)}"
+                own.mkdir()
+                (own / "calibration").symlink_to(folder / "calibration")
+                found = capture_choice(choice, own, subject=subject, seed=seed)
+                times = RunTimes(plan_s, found.capture_s, calibrate_s, found.reconstruct_s)
+                done[key] = MeasuredCapture(found.errors, times)
+            yield budget_s, choice, done[key]
+
+
+def _calibrate(rig: Rig, steps: Rehearsal, folder: Path, seed: int) -> float:
+    """Simulate the targets, calibrate, and return the processor seconds of the calibration."""
+    drawn = {"session_seed": seed}  # others set the constants of forecasts
     targets = {name: {**how, **drawn} for name, how in steps.targets.items()}
     calibrate_simulated(rig.name, folder, targets, (), seed=0)
     seconds = 0.0
@@ -159,32 +234,6 @@ def _calibrate(rig: Rig, folder: Path) -> float:
             partial(calibrate, kind, sessions, folder / "calibration"), 2
         )[0]
     return seconds
-
-
-def _measure_person(
-    rig: Rig, folder: Path, person: Person, budgets_s: Sequence[float], calibrate_s: float
-) -> Iterator[tuple[float, tuple[Mapping[str, float], ...]]]:
-    """Yield forecasts and measurements of a person for each budget."""
-    subject, seed = person
-    request = PlanRequest(subject=subject, seed=seed, budget_s=max(budgets_s))
-    begun_s = time.process_time()
-    choices = list_choices_within_budget(load_planner(rig.name).generate_choices, rig, request)
-    plan_s = time.process_time() - begun_s
-    done: dict[str, Any] = {}
-    for budget_s in budgets_s:
-        within = [one for one in choices if one.run_times["total"] <= budget_s]
-        if not within:
-            continue
-        choice = select_best(within, request.min_valid_fraction)
-        key = str(choice.plan.to_json())
-        if key not in done:
-            with tempfile.TemporaryDirectory() as name:
-                (Path(name) / "calibration").symlink_to(folder / "calibration")
-                done[key] = capture_choice(choice, Path(name), subject=subject, seed=seed)
-        found = done[key]
-        times = RunTimes(plan_s, found.capture_s, calibrate_s, found.reconstruct_s)
-        errors = {one: found.errors[one][0] for one in choice.medians}
-        yield budget_s, (choice.medians, choice.run_times, errors, times.by_phase())
 
 
 def _add_point(
@@ -208,6 +257,7 @@ def _add_point(
         "forecast error": float(forecasts.mean()),
         "least measured over forecast": float(ratios.min()),
         "largest measured over forecast": float(ratios.max()),
+        "inside the forecast's interval": sum(one[name] for one in point.inside),
         "forecast s": float(np.mean([one["total"] for one in point.forecast_s])),
     }
     half = float(errors.std(ddof=1) / math.sqrt(len(errors))) if len(errors) > 1 else 0.0

@@ -298,6 +298,7 @@ def simulate_probe(
     repeats: options.Placements = 1,
     angles: options.Directions = None,
     all_brackets: options.AllBrackets = False,
+    omit: str | None = None,
     renderer: options.Renderer = "mitsuba",
 ) -> None:
     """Simulate the fiber probe: tissue at several sites, or a target.
@@ -310,6 +311,9 @@ def simulate_probe(
         Simulated subject: preset I to VI, palest or darkest, ita:DEGREES, monk:N, a file
         NAME.toml, or a medium, homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with
         A = sigma_a and S = sigma_s', 1/mm, and AXIS in degrees.
+    omit
+        Visible effects to omit from the simulation, separated by commas: crosstalk, wings,
+        dark_current, thickness, melanin_depth, oxygenation, scattering, absorption.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names
     from skinrig.simulating.orders import ProbeOrder
@@ -322,6 +326,7 @@ def simulate_probe(
         repeats=repeats,
         angles=parse_floats(angles, "--angles"),
         all_brackets=all_brackets,
+        leave_out=parse_names(omit) or (),
         renderer=cast(Any, renderer),
     )
     _simulate(order, console, target)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.face import estimate_face
-from reconstruction.pipeline.flash.stages import load_skin_colors
+from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS, load_skin_colors
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.sensor import make_sensor, vignetting_map
@@ -26,15 +26,6 @@ WIDTH_PX = 256
 """Pixels across the face that the forecast looks at, each as noisy as one of the whole camera."""
 CONFIRM_PX = 640
 """Pixels across that are simulated: coarser ones mix the colors of different skin."""
-BIAS_PIXELS = 1000
-"""Pixels of a face from which its common error is estimated."""
-BIAS_NOISE = 2e-3
-"""Relative noise of these pixels, far below the model error."""
-SESSION_BIAS: Final[Mapping[str, float]] = {"melanin": 0.047, "hemoglobin": 0.038}
-"""Relative error of sessions beyond that of the estimator on colors without noise.
-
-Means of three faces of one calibration, see docs/validation/forecasts.md; its cause is unknown.
-"""
 MIXING_POWER = 1.6
 """Exponent of the model error's variance over pixel size, for pixels wider than `CONFIRM_PX` gives.
 
@@ -109,16 +100,22 @@ def simulate_observation(
     skin &= (melanin > 0) & (melanin <= table.c_m_max)
     skin &= (hemoglobin > 0) & (hemoglobin <= table.c_hd_max)
     gain, floor = chip.noise_profile(0.008)
+    shares, signal = _superpixel_variance_ratio(view.cfa), to_superpixels(light.astype(np.float64))
     over_white = to_superpixels((radiance / scene.white_rgb()).astype(np.float64))
-    bias = estimate_face_bias(over_white[skin], melanin[skin], hemoglobin[skin], small)
+    # one frame at full power, less one dark frame
+    noise = np.sqrt((gain * np.maximum(signal, 0.0) + 2.0 * floor) * shares)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        noise *= np.where(signal > 0.0, over_white / signal, np.inf)
+    truth_of = {"melanin": melanin, "hemoglobin": hemoglobin}
+    bias = estimate_face_bias(over_white, noise, truth_of, skin, small)
     return FlashObservation(
         melanin,
         hemoglobin,
-        to_superpixels(light.astype(np.float64)),
+        signal,
         skin,
         gain,
         floor,
-        _superpixel_variance_ratio(view.cfa),
+        shares,
         table,
         log_light_information(),
         bias,
@@ -127,40 +124,46 @@ def simulate_observation(
 
 
 def estimate_face_bias(
-    colors: Float64Array, melanin: Float64Array, hemoglobin: Float64Array, rig: Rig
+    colors: Float64Array,
+    noise: Float64Array,
+    truth: Mapping[str, Float64Array],
+    skin: BoolArray,
+    rig: Rig,
 ) -> dict[str, float]:
     """Return the relative error that the pixels of a face share, by chromophore.
 
-    It is the median over some pixels of the error of the estimator itself, without noise: of the
-    optics that it infers from the face, of its color table and of its prior. `SESSION_BIAS` is
-    added.
+    It is the median over the skin of the error of the estimator itself, on the image without noise:
+    of the optics that it infers from the face, of its color table and of its prior. As in a
+    session, the estimator gets all pixels with enough signal, also those at outlines and of lips.
 
     Parameters
     ----------
     colors
-        (n, 3) crossed-polarized light over that of a white reference.
-    melanin, hemoglobin
-        (n,) true volume fractions.
+        (H, W, 3) crossed-polarized light over that of a white reference.
+    noise
+        (H, W, 3) standard deviation of `colors`, for the estimator's weights.
+    truth
+        (H, W) true volume fractions by chromophore.
+    skin
+        (H, W) pixels to compare.
     rig
         The flash rig.
     """
     names = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
     table, prior = load_skin_colors(*names, has_white=True)
-    step = max(1, len(colors) // BIAS_PIXELS)
-    rgb = colors[::step].astype(np.float32)
-    found = estimate_face(
-        rgb,
-        table,
-        prior=prior,
-        variance=np.square(BIAS_NOISE * rgb),
-        model_error=model_error.load_covariance(),
-        has_white=True,
-    ).found
-    bias = {}
-    for name, truth in zip(CHROMOPHORE_NAMES, (melanin, hemoglobin), strict=True):
-        ratio = getattr(found, name)[found.valid] / truth[::step][found.valid]
-        bias[name] = SESSION_BIAS[name] + (float(np.median(ratio)) - 1.0 if ratio.size else 0.0)
-    return bias
+    usable = np.asarray((colors > MIN_SIGNAL_SIGMAS * noise).all(axis=-1), np.bool_)
+    rgb = np.where(usable[..., None], colors, np.nan).astype(np.float32)
+    variance = np.where(usable[..., None], np.square(noise), 0.0)
+    errors = model_error.image_covariance(np.nan_to_num(rgb), variance, usable)
+    given: dict[str, Any] = {"prior": prior, "variance": variance, "model_error": errors}
+    found = estimate_face(rgb, table, **given, has_white=True).found
+    good = skin & found.valid
+    return {
+        name: float(np.median(getattr(found, name)[good] / truth[name][good])) - 1.0
+        if good.any()
+        else 0.0
+        for name in CHROMOPHORE_NAMES
+    }
 
 
 def log_light_information() -> float:

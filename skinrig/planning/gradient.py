@@ -24,7 +24,7 @@ from reconstruction.photometric_stereo.light_selection import rayleigh_mixture_m
 from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array
-from skinrig.planning import plan_omissions, plans
+from skinrig.planning import plan_omissions, plans, time_budget
 from skinrig.planning.gradient_observation import (
     BORDER_PX,
     GradientObservation,
@@ -122,6 +122,8 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         Goal by name: "normals" in degrees, the median over the patch as imaged by the lens; empty:
         forecast of the rig's own plan. The valid fraction refers to the patch.
     """
+    if request.budget_s is not None:
+        return time_budget.choose_within_budget(generate_choices, rig, request)
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     if not request.goals:
         plan = gradient_plan(rig)
@@ -160,6 +162,16 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     return _choice(
         rig, observation, plan, setting, request, found=found, path=path, reasons=reasons
     )
+
+
+def generate_choices(
+    rig: Rig, request: PlanRequest, is_affordable: time_budget.Affordable
+) -> Iterator[PlanChoice]:
+    """Yield affordable plans with their forecasts, by increasing duration."""
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    for setting, plan in generate_candidates(rig, observation):
+        if is_affordable(rig, plan):
+            yield _choice(rig, observation, plan, setting, request)
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:

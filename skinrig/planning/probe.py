@@ -17,7 +17,7 @@ from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.evaluating import subsurface
-from skinrig.planning import plan_omissions, plans
+from skinrig.planning import plan_omissions, plans, time_budget
 from skinrig.planning.plans import PlanChoice, PlanRequest
 from skinrig.planning.probe_forecast import Memory, ProbePrediction, ProbeSettings, predict
 from skinrig.planning.probe_observation import ProbeObservation, simulate_observation
@@ -44,6 +44,8 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         colors; empty: forecast of the rig's own plan. The valid fraction refers to the valid fits
         of that plan.
     """
+    if request.budget_s is not None:
+        return time_budget.choose_within_budget(generate_choices, rig, request)
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     own, wants, valid_share = probe_plan(rig), request.goals, request.min_valid_fraction
     if not wants:
@@ -92,6 +94,21 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     found = predict(observation, setting, memory=memory)
     choice = _choice(rig, observation, plan, setting, found, wants)
     return replace(choice, path=path, reasons=reasons)
+
+
+def generate_choices(
+    rig: Rig, request: PlanRequest, is_affordable: time_budget.Affordable
+) -> Iterator[PlanChoice]:
+    """Yield affordable plans of all sites with their forecasts, by increasing duration.
+
+    They have the fewest dark frames: more hardly lower the error.
+    """
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    memory: Memory = {}
+    for setting, plan in generate_candidates(rig, observation):
+        if setting.darks == DARK_CHOICES[0] and is_affordable(rig, plan):
+            found = predict(observation, setting, memory=memory)
+            yield _choice(rig, observation, plan, setting, found, request.goals)
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.calibration.fiber.crosstalk import CrossTalk
+from capture.calibration.fiber.crosstalk import DISTANCE_EDGES, CrossTalk
 from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.probe import exposure_series_s
 from capture.plan.suction import HeadPlacement
@@ -24,11 +24,17 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.planning.plans import median_magnitude
 from skinrig.planning.probe_observation import ProbeObservation, reading_variance
 
-CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
-"""Standard uncertainty of cross-talk by distance in spots, the last for all larger distances.
+CROSSTALK_ERROR = (8.6e-6, 6.3e-6, 1.03e-6, 7.6e-7, 3.6e-7, 2.2e-7, 2.9e-7, 6.0e-7)
+"""Standard uncertainty of cross-talk by group of distances, see
+`capture.calibration.fiber.crosstalk.DISTANCE_EDGES`.
 
-Cross-talk is the fraction of a fiber's light in another spot. Medians of twenty simulated
-calibrations of the shipped rig, seeds 0 to 19.
+Cross-talk is the fraction of a fiber's light in another spot. Medians of four simulated
+calibrations of the shipped rig, seeds 9200 to 9203.
+"""
+STRAY_LIGHT_ERROR_PER_MM2 = (1.6e-9, 9.7e-10, 1.8e-9)
+"""Standard uncertainty of stray light, common to all fibers, as reflectance, red, green and blue.
+
+Medians of the same calibrations.
 """
 FORECAST_RELATIVE_SD = 0.2
 """Relative standard deviation of a session's reported from its forecast uncertainties.
@@ -61,8 +67,9 @@ class ProbePrediction:
     """(S, 3) standard uncertainty by readings, misfit and certificate.
 
     At sites without a measurement: that of the prediction from the other sites and the population.
-    The error of a noise-free fit on this skin is one sample of the misfit, and not added again.
     """
+    bias: Float64Array
+    """(S, 3) relative error of the fit to this skin without noise, 0 where it is unknown."""
     shared: Float64Array
     """(T, S, 3) errors by the calibration: effect of each of T error sources (certificate, far
     cross-talk) on all sites and colors. They are correlated, so that a median does not average
@@ -82,7 +89,7 @@ class ProbePrediction:
     @property
     def median(self) -> float:
         """Predicted median relative error over measured sites and colors."""
-        return median_magnitude(self.total)
+        return median_magnitude(self.total, self.bias[self.valid & self.measured[:, None]])
 
     @property
     def common(self) -> Float64Array:
@@ -102,7 +109,7 @@ class ProbePrediction:
         own = np.sqrt(np.maximum(self.sigma[good] ** 2 - np.square(shared).sum(axis=0), 0.0))
         rng = np.random.default_rng(0)
         off = rng.standard_normal((INTERVAL_DRAWS, len(shared))) @ shared
-        off += own * rng.standard_normal((INTERVAL_DRAWS, own.size))
+        off += self.bias[good] + own * rng.standard_normal((INTERVAL_DRAWS, own.size))
         ends = np.quantile(np.median(np.abs(off), axis=1), (0.16, 0.84))
         # combined in logarithms with the relative deviation of a session's stated uncertainties
         low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_RELATIVE_SD))
@@ -141,7 +148,7 @@ def predict(
     memory = {} if memory is None else memory
     shape = (len(observation.sites), 3)
     sigma, shared = np.full(shape, np.inf), np.zeros((0, *shape))
-    still, found = np.full(shape, np.inf), np.ones(shape)
+    still, found, bias = np.full(shape, np.inf), np.ones(shape), np.zeros(shape)
     valid = np.zeros(shape, np.bool_)
     measured = np.zeros(len(observation.sites), np.bool_)
     places = [k for k, site in enumerate(observation.sites) if site in setting.sites]
@@ -152,6 +159,7 @@ def predict(
         measured[k] = True
         valid[k] = fit.fit.valid
         found[k] = fit.fit.sigma_tr_per_mm
+        bias[k] = np.nan_to_num(found[k] / observation.sigma_tr[k] - 1.0)
         if not len(shared):
             shared = np.zeros((len(fit.log_common), *shape))
         shared[:, k] = fit.log_common
@@ -163,7 +171,7 @@ def predict(
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
     rest = _interpolation_error(observation, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return ProbePrediction(observation.sites, sigma, shared, still, valid, measured)
+    return ProbePrediction(observation.sites, sigma, bias, shared, still, valid, measured)
 
 
 def _fits(
@@ -209,9 +217,12 @@ def _fit_noisy_profiles(
         value = observation.reflectance[k]
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
-        optics = (value, observation.phantom, value / observation.phantom)
+        ratio = value / observation.phantom
+        optics = (value, observation.phantom, ratio)
         doubt, shared = mixed.matrix_variance(*optics), mixed.shared_changes(*optics)
-        common = np.concatenate([value * observation.common, shared])
+        # the phantom's light has the same error of stray light, which cancels in part
+        stray = -np.array(STRAY_LIGHT_ERROR_PER_MM2) * (1.0 - ratio)
+        common = np.concatenate([value * observation.common, stray[None], shared])
         variance += gain * value**2 + doubt
         reflectance = FiberReflectance(names, radius, value, variance, common, valid, ~valid)
         head = Measurement(
@@ -229,9 +240,9 @@ def _crosstalk(count: int) -> Any:
     between skin and phantom.
     """
     place = np.arange(count)
-    apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
+    group = np.searchsorted(DISTANCE_EDGES, np.abs(place[:, None] - place), side="right")
     nothing = np.zeros((count, 3))
-    error = np.array(CROSSTALK_ERROR)[apart]
+    error = np.array((0.0, *CROSSTALK_ERROR))[group]
     return CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
 
 

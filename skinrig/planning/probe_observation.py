@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from capture.plan.probe import PROBE_SITES
-from capture.rig import Rig
+from capture.rig import Probe, Rig
 from model import spectra
 from rigsim.as_built.probe import SPOT_RADIUS_PX
-from rigsim.fiber.probe_profile import ProfileCache
+from rigsim.fiber.homogeneous_fit import FitError, fit_homogeneous_medium
+from rigsim.fiber.probe_profile import ProfileCache, probe_fibers
 from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import DARK_CURRENT_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
 from rigsim.sensor import make_sensor
@@ -31,6 +32,9 @@ class ProbeObservation:
     sites: tuple[str, ...]
     reflectance: Float64Array
     """(S, F, 3) radial reflectance of the skin, 1/mm^2."""
+    sigma_tr: Float64Array
+    """(S, 3) sigma_tr of the homogeneous medium nearest to it, the ground truth, 1/mm; NaN where
+    too few fibers are bright."""
     phantom: Float64Array
     """(F, 3) radial reflectance of the calibration phantom, 1/mm^2."""
     phantom_error: Float64Array
@@ -78,6 +82,7 @@ def simulate_observation(
     return ProbeObservation(
         tuple(sites),
         reflectance,
+        np.array([[_nearest_sigma_tr(one, rig.probe) for one in each.T] for each in reflectance]),
         block.per_mm2,
         block.stderr / block.per_mm2,
         block.common,
@@ -86,6 +91,13 @@ def simulate_observation(
         make_sensor(view, dark_e_per_s=DARK_CURRENT_E_PER_S, vignetting=LENS_VIGNETTING),
         rig.probe,
     )
+
+
+def _nearest_sigma_tr(profile: Float64Array, probe: Probe) -> float:
+    try:
+        return fit_homogeneous_medium(profile, probe_fibers(probe)).sigma_tr_per_mm
+    except FitError:
+        return math.nan
 
 
 def reading_variance(

@@ -26,7 +26,7 @@ SWITCHES_BY_RIG: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
             *TISSUE_SWITCHES,
         ),
         "gradient": ("shadows", "lateral", "interreflections", "optics", *TISSUE_SWITCHES),
-        "probe": (),
+        "probe": ("crosstalk", "wings", "dark_current", *TISSUE_SWITCHES),
     }
 )
 """Omittable effects of each rig, by the ``switch`` of the effect, see `rigsim.needs.effects`."""

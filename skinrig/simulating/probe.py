@@ -10,6 +10,7 @@ from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.fiber.probe_tissue import PHANTOM_BLOCK as BLOCK
 from rigsim.fiber.probe_tissue import TissueError
+from rigsim.needs.effects import AUTOMATIC_EFFECTS, SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import ProbePlacement, ProbeScene
 from rigsim.scenes.probe.scene import probe_truth as ground_truth
@@ -58,8 +59,11 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
 
 def _build_scene(rig: Rig, plan: Plan, order: ProbeOrder) -> Any:
     given = select_attributes(order, "subject", "seed", "noise_seed")
+    effects = SceneEffects.from_switches(order.scene_switches())
     if order.renderer != "reference" or order.target is not None:
-        return make_scene(rig, order.target, photons=TRUTH_PHOTONS[order.size], **given)
+        photons = TRUTH_PHOTONS[order.size]
+        return make_scene(rig, order.target, photons=photons, effects=effects, **given)
+    order.refuse_options("probe (renderer reference)", "leave_out")
     places = {(head.site, head.angle_deg) for head, _ in group_by_series(plan)}
     return reference.make_probe_scene(
         rig, places=places, **given, **select_attributes(order, "size", "progress")
@@ -84,6 +88,7 @@ def make_scene(
     seed: int,
     photons: int,
     noise_seed: int | None = None,
+    effects: SceneEffects = AUTOMATIC_EFFECTS,
 ) -> Any:
     """Return the scene of a tissue or a target under the probe's actual fibers.
 
@@ -101,6 +106,8 @@ def make_scene(
         Seed of the sensor's noise; default `seed`.
     photons : int
         Photons per site and angle.
+    effects : SceneEffects
+        Requested effects.
 
     Raises
     ------
@@ -111,7 +118,9 @@ def make_scene(
         tissue = BLOCK if target == "phantom" else subject_file.load_tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    return ProbeScene(rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons)
+    return ProbeScene(
+        rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons, effects=effects
+    )
 
 
 class HeadLog(SceneLog):

@@ -28,7 +28,7 @@ BLUR_SIGMAS: Final = 5.0
 """Reach of the lens's blur, standard deviations."""
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=2)
 def render_fiber_images(build: ActualProbe, view: View) -> Float32Array:
     """Render the image of each fiber's light, wings and veil included; once per probe.
 

@@ -26,8 +26,13 @@ from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
 from rigsim.mitsuba.variant import Renderer, choose_variant
-from rigsim.needs.effects import PixelNoise
-from rigsim.needs.probe import equivalent_pixels, select_probe_effects
+from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
+from rigsim.needs.probe import (
+    CROSSTALK_EFFECT,
+    DARK_CURRENT_EFFECT,
+    WINGS_EFFECT,
+    select_probe_effects,
+)
 from rigsim.needs.tissue import select_probed_tissue
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.scenes.probe.detector import render_fiber_images
@@ -80,6 +85,8 @@ class ProbeScene(RigScene):
         Seeds the variation between exposures of one session; None: `seed`.
     photons
         Photons per site and angle.
+    effects
+        Requested effects; by default those that change readings.
     """
 
     renderer: Renderer = "mitsuba"
@@ -95,6 +102,7 @@ class ProbeScene(RigScene):
         seed: int = 0,
         noise_seed: int | None = None,
         photons: int = PHOTONS_PER_ANGLE,
+        effects: SceneEffects = AUTOMATIC_EFFECTS,
     ) -> None:
         if rig.probe is None or len(rig.views) != 1:
             raise SceneError(f"rig {rig.name!r}: expected a contact probe and one view")
@@ -112,7 +120,6 @@ class ProbeScene(RigScene):
         self._sensor = make_sensor(self._view, **dark) if sensor is None else sensor
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
         images = render_fiber_images(self.build, self._view)
-        self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
         """Added dark current of hot pixels at `DARK_CURRENT_REFERENCE_C`, electrons/s,
         shape (H, W)."""
@@ -123,9 +130,20 @@ class ProbeScene(RigScene):
             self.build,
             noise=PixelNoise.of(self._sensor),
             hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
-            spot_pixels=equivalent_pixels(images),
+            unit_rgb=PROBE_METER_RATE_PER_S * MAX_USUAL_EXPOSURE_S * self.white,
+            spots=images,
+            effects=effects,
         )
         """Effects with their verdicts and reasons."""
+        if not self.needs.builds(CROSSTALK_EFFECT):
+            self.build = dataclasses.replace(self.build, crosstalk=np.eye(len(self.build.gain)))
+        if not self.needs.builds(WINGS_EFFECT):
+            self.build = dataclasses.replace(self.build, wings=0.0)
+            images = render_fiber_images(self.build, self._view)
+        if not self.needs.builds(DARK_CURRENT_EFFECT):
+            self.hot_e_per_s = np.zeros_like(self.hot_e_per_s)
+            self._sensor = dataclasses.replace(self._sensor, dark_e_per_s=0.0)
+        self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         built = select_probed_tissue(tissue, self.needs)
         self.profiles = ProfileCache(rig, built, photons=photons, seed=seed)
 

@@ -2,24 +2,36 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from capture.rig import load_rig
-from rigsim.fiber.probe_tissue import HomogeneousTissue
+from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_tissue
+from rigsim.needs.effects import SceneEffects
 from rigsim.needs.face import LATERAL_EFFECT
-from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
+from rigsim.needs.probe import (
+    COLOR_EFFECT,
+    CROSSTALK_EFFECT,
+    DARK_CURRENT_EFFECT,
+    WINGS_EFFECT,
+    predict_light,
+)
 from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
+from rigsim.subject.person_skin import SITE_NAMES
 from rigsim.world.suction import HeadState
-from skinrig.arrays import Float32Array
+from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.simulation import omission_cases, tissue_omissions
-from skinrig.benchmarks.simulation.omission_cases import ComparedScene, EffectComparison
+from skinrig.benchmarks.simulation.omission_cases import (
+    FLOAT32_ROUNDING,
+    ComparedScene,
+    EffectComparison,
+)
 from skinrig.benchmarks.stage import BenchmarkStage
 
 NO_MEMORY_REASON = "scenes share traced rays, so that memory has no single scene"
@@ -31,6 +43,8 @@ incidence (cos 88 degrees)."""
 DOME_PX = 100
 GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
+PROBE_SITE = "cheek"
+PRESET_NAMES = ("I", "II", "III", "IV", "V", "VI")
 N_PEOPLE = 20
 N_TOY_PEOPLE = 1
 
@@ -93,7 +107,7 @@ def _changes_more_than_effect(comparison: EffectComparison) -> bool:
 
 def _cases(toy: bool) -> Iterator[EffectComparison]:
     yield from omission_cases.check_flat_targets()
-    yield from compare_gray_tissue()
+    yield from compare_probe(toy=toy)
     if toy:
         yield from omission_cases.compare_flash_face("darkest", width_px=64, texels=64)
         return
@@ -109,8 +123,11 @@ def _cases(toy: bool) -> Iterator[EffectComparison]:
     yield from omission_cases.compare_gradient_skin("forehead", width_px=GRADIENT_PX)
 
 
-def compare_gray_tissue() -> Iterator[EffectComparison]:
-    """Compare a gray medium with one color and with 31 wavelengths, by the same photons."""
+def compare_probe(*, toy: bool = False) -> Iterator[EffectComparison]:
+    """Compare scenes of the probe: a gray medium by color, and people by the actual probe.
+
+    The medium has one color or 31 wavelengths, by the same photons.
+    """
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
     bands = tuple(float(nm) for nm in range(400, 701, 10))
@@ -129,33 +146,70 @@ def compare_gray_tissue() -> Iterator[EffectComparison]:
             raise ValueError("gray tissue: got no profile, expected a head on skin; place the head")
         images.append(made.image(made.transmit_through_fibers(profile.reflectance_per_mm2)))
     brightest = np.float32(images[0].max())
-    scene = ProbeScene(rig, gray)
-    compared = ComparedScene("probe", "gray medium", scene)
+    compared = ComparedScene("probe", "gray medium", ProbeScene(rig, gray))
     have, lack = (part / brightest for part in images)  # stored photons, the same for both
-    yield compared.compare_images(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
-    yield from _compare_probe_build(compared, head)
-
-
-def _compare_probe_build(compared: ComparedScene, head: HeadState) -> Iterator[EffectComparison]:
-    """Compare the actual probe with one without cross-talk, wings or dark current."""
-    scene = compared.scene
-    profile, build = scene.profile(head), scene.build
-
-    def timed(made: ProbeScene) -> tuple[float, Float32Array]:
-        return measure_processor_time(
-            lambda: made.image(made.transmit_through_fibers(profile.reflectance_per_mm2))
-        )
-
-    with_s, have = timed(scene)
-    unit = np.float32(have.max())
-    plain = {
-        CROSSTALK_EFFECT: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
-        WINGS_EFFECT: dataclasses.replace(build, wings=0.0),
+    effect = compared.scene.needs[COLOR_EFFECT]
+    yield compared.compare_images(effect, have, lack, (seconds[0], seconds[1]))
+    bare = {
+        switch: ProbeScene(rig, gray, effects=SceneEffects.from_switches({switch: False}))
+        for switch in ("crosstalk", "wings")
     }
-    for name, without in plain.items():
-        without_s, lack = timed(ProbeScene(scene.rig, scene.tissue, build=without))
-        yield compared.compare_images(
-            scene.needs[name], have / unit, lack / unit, (with_s, without_s)
+    for number in range(1 if toy else N_PEOPLE):
+        preset = PRESET_NAMES[number % len(PRESET_NAMES)]
+        skin = parse_tissue(preset, seed=number)
+        compared = ComparedScene("probe", f"{preset}, seed {number}", ProbeScene(rig, skin))
+        yield from _compare_probe_build(compared, bare)
+
+
+def spot_masks(scene: ProbeScene) -> Float32Array:
+    """Return the pixels of each fiber's spot, 0 or 1, shape (F, H W)."""
+    view, build = scene.rig.views[0], scene.build
+    y, x = np.mgrid[: view.height_px, : view.width_px].reshape(2, 1, -1)
+    left, top = build.spot_px.T[:, :, None]
+    inside = np.hypot(x - left, y - top) <= build.radius_px[:, None]
+    return inside.astype(np.float32)
+
+
+def read_spots(scene: ProbeScene, spots: ProbeScene, reflectance: Float64Array) -> Float64Array:
+    """Return the mean signal in each spot in the longest exposure, full scales, (F, 3).
+
+    Parameters
+    ----------
+    scene
+        Scene of the light.
+    spots
+        Scene of the spots.
+    reflectance
+        Light in the fibers, 1/mm^2, (F, 3).
+    """
+    masks = spot_masks(spots)
+    image = scene.image(scene.transmit_through_fibers(reflectance)).reshape(-1, 3)
+    mean = masks @ image / masks.sum(axis=1)[:, None]
+    return np.asarray(MAX_USUAL_EXPOSURE_S * mean, np.float64)
+
+
+def _compare_probe_build(
+    compared: ComparedScene, bare: Mapping[str, ProbeScene]
+) -> Iterator[EffectComparison]:
+    """Compare the actual probe with one without cross-talk, wings or dark current.
+
+    ``bare`` has scenes without an effect by its switch, of any tissue.
+    """
+    scene = compared.scene
+    # by the tables: ratios of neighbors with few photons are those of noise
+    reflectance = predict_light(scene.rig, scene.tissue)[SITE_NAMES.index(PROBE_SITE)]
+    with_s, have = measure_processor_time(partial(read_spots, scene, scene, reflectance))
+    for name in (CROSSTALK_EFFECT, WINGS_EFFECT):
+        other = bare[scene.needs[name].switch]
+        without_s, lack = measure_processor_time(partial(read_spots, other, scene, reflectance))
+        # in the longest exposure in which the spot is not saturated
+        share = 1.0 / np.maximum(have, 1.0)
+        over = np.abs(have - lack) * share / compared.noise.sigma(have * share)
+        found = float((over * spot_masks(scene).sum(axis=1)[:, None] ** 0.5).max())
+        effect = scene.needs[name]
+        yield EffectComparison(
+            *(compared.rig, compared.subject, name, effect.verdict, effect.over_noise),
+            *(found, found * FLOAT32_ROUNDING, with_s, without_s),
         )
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)

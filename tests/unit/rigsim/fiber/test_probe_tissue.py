@@ -10,7 +10,7 @@ import pytest
 
 from capture.calibration.fiber.phantom import read_certificate
 from capture.rig import load_rig
-from rigsim.fiber import probe_tissue
+from rigsim.fiber import probe_profile, probe_tissue
 from rigsim.fiber.probe_profile import ProfileCache, probe_fibers, smooth_profile
 from rigsim.fiber.probe_tissue import (
     PHANTOM_BLOCK,
@@ -22,7 +22,7 @@ from rigsim.fiber.probe_tissue import (
     parse_tissue,
     phantom_certificate,
 )
-from rigsim.fiber.profile import trace_fiber_profile
+from rigsim.fiber.profile import trace_fiber_paths, trace_fiber_profile
 from rigsim.subject import tissue_pressure
 from rigsim.subject.person_skin import PersonSkin, layers
 from rigsim.tissue import skin_layers
@@ -179,3 +179,25 @@ def test_wrong_subjects_are_refused():
     assert parse_tissue("homogeneous:0.1,2,0.9").g == 0.9
     with pytest.raises(TissueError, match="site"):
         SkinTissue(PersonSkin.of_preset("III")).optics("elbow", 0.0, 60.0)
+
+
+def test_scenes_of_one_seed_share_photons(monkeypatch):
+    traced = []
+
+    def trace(*args, **settings):
+        traced.append(settings["photons"])
+        return trace_fiber_paths(*args, **settings)
+
+    monkeypatch.setattr(probe_profile, "trace_fiber_paths", trace)
+    skin = parse_tissue("II", seed=87)
+
+    def profile(tissue, seed):
+        cache = ProfileCache(RIG, tissue, photons=500, seed=seed, threads=1)
+        return cache.profile("chin").reflectance_per_mm2
+
+    first, again = (profile(parse_tissue("II", seed=87), 5) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(traced) == 1
+    assert (profile(skin, 6) != first).any()
+    assert (profile(parse_tissue("II", seed=88), 5) != first).any()
+    assert len(traced) == 3

@@ -176,7 +176,9 @@ def test_probe_builds_what_readings_show():
     assert all(shown.needs.builds(name) for name in PROPERTIES)
     assert not any(hidden.needs.builds(name) for name in PROPERTIES)
     assert hidden.profiles.tissue.person.tissue == TYPICAL_SKIN
-    assert {shown.needs[name].switch for name in PROPERTIES} == {""}
+    assert {shown.needs[name].switch for name in PROPERTIES} == {
+        rule.switch for rule in TISSUE_RULES
+    }
 
 
 def test_selection_keeps_built_properties_only():

@@ -19,6 +19,7 @@ def measured_case(error_factors, time_factor):
             seconds = dict.fromkeys(end_to_end.RUN_PHASES, 0.25 * budget_s)
             point.forecast.append({"melanin": expected})
             point.measured.append({"melanin": factor * expected})
+            point.inside.append({"melanin": factor < 1.0})
             point.forecast_s.append(seconds | {"total": budget_s})
             longer = {name: time_factor * value for name, value in seconds.items()}
             point.measured_s.append(longer | {"total": time_factor * budget_s})
@@ -51,6 +52,15 @@ def test_wrong_forecast_misses_limit_either_way(monkeypatch, factors, time_facto
     assert found.limits[1].passed == (time_factor == 1.0)
 
 
+def test_wide_forecast_is_judged_by_coverage(monkeypatch):
+    case = end_to_end.EndToEndCase((), {}, by_coverage=True)
+    monkeypatch.setattr(end_to_end, "CASES", {"flash": case})
+    for factors, passed in (((0.5, 2.0), True), ((1.5, 2.0), False)):
+        coverage, _ = run(monkeypatch, factors).limits
+        assert coverage.got == pytest.approx(0.5 if passed else 0.0)
+        assert coverage.passed == passed
+
+
 def test_points_hold_total_seconds_and_mean_error(monkeypatch):
     found = run(monkeypatch, (0.5, 1.5), time_factor=2.0)
     assert [point.timing.seconds for point in found.points] == [2.0 * b for b in BUDGETS_S]
@@ -58,6 +68,7 @@ def test_points_hold_total_seconds_and_mean_error(monkeypatch):
     assert first.error == pytest.approx(100.0 / BUDGETS_S[0])
     assert first.error_interval[0] < first.error < first.error_interval[1]
     assert first.extra_values["people"] == 2
+    assert first.extra_values["inside the forecast's interval"] == 1
     assert first.extra_values["capture, s"] == pytest.approx(0.5 * BUDGETS_S[0])
 
 

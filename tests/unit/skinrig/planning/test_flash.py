@@ -9,6 +9,7 @@ import pytest
 
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
+from reconstruction.pipeline.flash.stages import load_skin_colors
 from skinrig.cli import main
 from skinrig.planning import flash, flash_observation, plans
 
@@ -41,6 +42,31 @@ def test_more_frames_and_darks_lower_error_to_model(look):
     still = replace(look, gain=0.0, floor=0.0)
     floor = flash.predict(still, repeats=1, power=1.0, darks=0).median("melanin")
     assert floor < median(repeats=16, power=1.0, darks=4) < 1.2 * floor
+
+
+def test_common_error_is_that_of_image(rig):
+    table, _ = load_skin_colors(
+        rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, has_white=True
+    )
+    skin = np.ones((24, 24), bool)
+    rng = np.random.default_rng(2)
+    truth = {
+        "melanin": 0.03 * np.exp(0.15 * rng.standard_normal(skin.shape)),
+        "hemoglobin": 0.02 * np.exp(0.15 * rng.standard_normal(skin.shape)),
+    }
+    light = 0.7 * np.exp(0.1 * rng.standard_normal((*skin.shape, 1)))
+    colors = light * table.lookup(truth["melanin"], truth["hemoglobin"])
+    noise = 2e-3 * colors
+
+    def common_error(seen, known):
+        return flash_observation.estimate_face_bias(seen, noise, known, skin, rig)
+
+    own = common_error(colors, truth)
+    # a truth that is a tenth lower, and an image that is too yellow
+    lower = common_error(colors, {name: 0.9 * value for name, value in truth.items()})
+    assert lower["melanin"] == pytest.approx((1.0 + own["melanin"]) / 0.9 - 1.0)
+    yellow = common_error(colors * [1.0, 1.0, 0.9], truth)
+    assert yellow["melanin"] > own["melanin"] + 0.03
 
 
 def test_four_frames_halve_noise_error(look):

@@ -61,6 +61,16 @@ def test_quickest_scan_reaching_error_is_chosen(small, tmp_path, capsys):
     assert again["forecasts"][0]["median"] == pytest.approx(last["normals_deg"], rel=1e-9)
 
 
+def test_budget_chooses_least_error_within_time(small, rig):
+    found = gradient.choose(rig, plans.PlanRequest(budget_s=60.0))
+    assert found.run_times["total"] <= 60.0
+    assert found.medians["normals"] == pytest.approx(min(p["normals"] for p in found.path))
+    least_s = min(path["total_s"] for path in found.path)
+    short = gradient.choose(rig, plans.PlanRequest(budget_s=least_s + 0.01))
+    assert short.seconds < found.seconds
+    assert short.medians["normals"] > found.medians["normals"]
+
+
 def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
     monkeypatch.setattr(gradient, "PATTERN_SETS", PATTERN_SETS[:1])
     monkeypatch.setattr(gradient, "EXPOSURE_CHOICES", (1.0,))

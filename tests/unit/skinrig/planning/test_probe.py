@@ -68,7 +68,8 @@ def test_interval_is_wide_when_fits_share_error():
 
     def ends(shared):
         sigma, valid, measured = told
-        found = probe.ProbePrediction(("x",) * 12, sigma, shared, sigma, valid, measured)
+        still = np.zeros(shape)
+        found = probe.ProbePrediction(("x",) * 12, sigma, still, shared, sigma, valid, measured)
         return np.array(found.interval()) / found.median
 
     # one error alone: |z| over its median 0.6745, of which 68 % lie between 0.299 and 2.083
@@ -107,6 +108,18 @@ def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     assert main(["plan", "probe", "--forecast", str(file), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["forecasts"][0]["median"] == pytest.approx(document["forecasts"][0]["median"])
+
+
+def test_budget_lowers_error_and_keeps_time(small, rig):
+    times = []
+    for budget_s in (40.0, 60.0, 120.0):
+        found = probe.choose(rig, plans.PlanRequest(budget_s=budget_s))
+        assert found.run_times["total"] <= budget_s
+        assert found.run_times["capture"] == pytest.approx(found.seconds)
+        assert found.medians["sigma_tr"] == pytest.approx(min(p["sigma_tr"] for p in found.path))
+        times.append((found.medians["sigma_tr"], found.seconds))
+    assert times[0][0] > times[-1][0]
+    assert times[0][1] < times[-1][1]
 
 
 def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):

@@ -112,7 +112,7 @@ def test_plan_command_keeps_budget(monkeypatch, rig, tmp_path, capsys):
         (["flash", "--budget", "60s", "--bands", "460"], 2, "together with --bands"),
         (["flash", "--budget", "60"], 2, "add the unit"),
         (["flash", "--budget", "0s"], 3, "above 0"),
-        (["dome", "--budget", "60s"], 2, "option of flash, not of dome"),
+        (["dome", "--budget", "60s"], 2, "not an option of the dome rig"),
     ],
 )
 def test_plan_command_refuses_unusable_budget(argv, code, words, capsys):

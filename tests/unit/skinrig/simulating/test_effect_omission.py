@@ -13,7 +13,7 @@ from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 
 
-@pytest.mark.parametrize("rig", ["flash", "dome", "gradient"])
+@pytest.mark.parametrize("rig", SWITCHES_BY_RIG)
 def test_every_name_is_an_effect_that_scenes_take(rig):
     for name in SWITCHES_BY_RIG[rig]:
         asked = dataclasses.asdict(SceneEffects.from_switches({name: False}))
@@ -37,7 +37,7 @@ def test_omitted_flash_effects_are_reported_by_name(tmp_path):
     [
         ("flash", {"leave_out": ("shadow",)}, "'shadow', expected for the flash rig one of lat"),
         ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
-        ("probe", {"leave_out": ("optics",)}, "expected for the probe rig none; remove"),
+        ("probe", {"leave_out": ("optics",)}, "expected for the probe rig one of crosstalk"),
         ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface is also requested"),
         ("flash", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
         ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
