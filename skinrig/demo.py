@@ -27,7 +27,7 @@ from skinrig.errors import EXIT_INTERRUPTED
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
 from skinrig.progress import beat_while_running
-from skinrig.resources import require_resources_of_tasks
+from skinrig.resources.forecast import require_resources_of_tasks
 from skinrig.simulating.simulation import list_tasks
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from capture.session import Session
-from skinrig.resources import count_megapixels, measure_folder_mb
+from skinrig.resources.forecast import count_megapixels, measure_folder_mb
 
 Size = tuple[str, ...]
 SIZES: dict[str, dict[str, tuple[Size, ...]]] = {

@@ -16,7 +16,7 @@ from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
 from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error, require_choice
-from skinrig.resources import forecast_resources, require_resources
+from skinrig.resources.forecast import forecast_resources, require_resources
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function by stage. A module is imported, and its kernels are compiled, when the stage

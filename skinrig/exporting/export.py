@@ -14,7 +14,7 @@ from skinrig.appearances.dynamic import describe_parts
 from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import ExportResult, export_sealed
-from skinrig.resources import forecast_resources, measure_folder_mb, require_resources
+from skinrig.resources.forecast import forecast_resources, measure_folder_mb, require_resources
 
 APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps.write",

@@ -21,7 +21,7 @@ from rigsim.world import World
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
-from skinrig.resources import (
+from skinrig.resources.forecast import (
     count_megapixels,
     forecast_resources,
     forecast_smaller_widths,

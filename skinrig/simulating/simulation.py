@@ -4,7 +4,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from skinrig.resources import Task, count_megapixels
+from skinrig.resources.forecast import Task, count_megapixels
 from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
 from skinrig.simulating.resumption import SessionComplete
 

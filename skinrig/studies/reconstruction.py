@@ -12,7 +12,7 @@ from reconstruction.pipeline import recipes
 from reconstruction.pipeline.inputs import DomeOptions
 from reconstruction.tiles import map_tiles
 from skinrig.errors import UnusableError
-from skinrig.resources import Task, count_megapixels, require_resources_of_tasks
+from skinrig.resources.forecast import Task, count_megapixels, require_resources_of_tasks
 from skinrig.studies.description import require_software, software_hash
 from skinrig.studies.executors import (
     ExecutorLost,

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from skinrig.resources import Task, require_resources_of_tasks
+from skinrig.resources.forecast import Task, require_resources_of_tasks
 from skinrig.simulating.simulation import list_tasks
 from skinrig.studies import results
 from skinrig.studies.cases import (

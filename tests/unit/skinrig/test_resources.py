@@ -10,10 +10,11 @@ from collections import namedtuple
 
 import pytest
 
-from skinrig import resources
 from skinrig.cli import main
 from skinrig.errors import EXIT_BAD_INPUT, UnusableError
-from skinrig.resources import FreeMemory, ResourceForecast, read_free_memory
+from skinrig.resources import forecast as resources
+from skinrig.resources.forecast import ResourceForecast
+from skinrig.resources.free_memory import FreeMemory, read_free_memory
 
 Usage = namedtuple("Usage", "total used free")
 LIMIT_BYTES = 2 * 10**9
@@ -168,9 +169,9 @@ def limit_addresses():
 @pytest.mark.parametrize("forecast", [True, False])
 def test_limit_of_addresses_gives_one_error(forecast, tmp_path):
     """Without the forecast the work begins, and the allocation that fails ends it alike."""
-    code = "import sys; from skinrig import cli, resources; "
+    code = "import sys; from skinrig import cli; from skinrig.resources import forecast; "
     if not forecast:
-        code += "resources.ResourceForecast.fits = lambda self, free: True; "
+        code += "forecast.ResourceForecast.fits = lambda self, free: True; "
     argv = ["simulate", "flash", "--width", "6000", "--out", str(tmp_path / "out")]
     done = subprocess.run(
         [sys.executable, "-c", f"{code}sys.exit(cli.main(sys.argv[1:]))", *argv],
