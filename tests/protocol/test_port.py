@@ -129,8 +129,10 @@ def test_retry_sends_same_bytes_after_newline(open_port):
         (ask(8, "FLAS:FIRE a", retry=True), b""),
         (ask(8, "FLAS:FIRE a", retry=True), say(8, "done")),
     )
+    frames = port.statistics.frames
     assert port.ask("FLAS:FIRE a") == "done"
     assert port.statistics.retries == 2
+    assert port.statistics.frames == frames + 3
 
 
 def test_nak_triggers_immediate_retry(open_port):
