@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from capture.plan.rig_kinds import find_rig_kind
-from capture.session import Session
+from capture.session import Session, SessionError
 from reconstruction.pipeline import recipes
 from reconstruction.pipeline.inputs import DomeOptions
 from reconstruction.tiles import map_tiles
@@ -96,10 +96,16 @@ def _reconstruct_on_worker(order: ReconstructionOrder, software: str) -> Reconst
 
 
 def _require_room(orders: Sequence[ReconstructionOrder], executor: str) -> None:
-    """Raise unless memory and disk suffice; images under lights of a list are not forecast."""
+    """Raise unless memory and disk suffice; images under lights of a list are not forecast.
+
+    A session that cannot be read here is refused when its own turn comes.
+    """
     tasks = []
     for order in orders:
-        session = Session.open(order.session)
+        try:
+            session = Session.open(order.session)
+        except SessionError:
+            continue
         if "light_list" not in session.manifest.extra:
             work = f"reconstruct {find_rig_kind(session.rig)}"
             tasks.append(Task(work, count_megapixels(session.rig, session.plan)))

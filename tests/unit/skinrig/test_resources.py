@@ -7,14 +7,21 @@ import shutil
 import subprocess
 import sys
 from collections import namedtuple
+from types import SimpleNamespace
 
 import pytest
 
+from capture.plan.dome import dome_plan
+from capture.rig import load_rig
+from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.cli import main
 from skinrig.errors import EXIT_BAD_INPUT, UnusableError
 from skinrig.resources import forecast as resources
 from skinrig.resources.forecast import ResourceForecast
 from skinrig.resources.free_memory import FreeMemory, read_free_memory
+from skinrig.studies import reconstruction, study
+from skinrig.studies.description import CaseSize
+from skinrig.studies.reconstruction import ReconstructionOrder
 
 Usage = namedtuple("Usage", "total used free")
 LIMIT_BYTES = 2 * 10**9
@@ -159,6 +166,40 @@ def test_fewer_processes_are_advised(free, tmp_path):
         resources.require_resources_of_tasks(tasks, tmp_path, processes=4, outputs=2)
     resources.require_resources_of_tasks(tasks, tmp_path, processes=2, outputs=2)
     resources.require_resources_of_tasks(tasks, tmp_path, processes=0, outputs=2)
+
+
+def test_export_without_memory_is_refused_first(tmp_path, free, capsys):
+    free(10.0)
+    assert main(["export", str(tmp_path), "--to", "maps", "--out", str(tmp_path / "x")]) == 3
+    assert "export --to maps needs about" in capsys.readouterr().err
+
+
+def test_reconstruction_without_memory_is_refused_first(tmp_path, free, monkeypatch):
+    rig = load_rig("dome")
+    opened = SimpleNamespace(manifest=SimpleNamespace(extra={}), rig=rig, plan=dome_plan(rig))
+    monkeypatch.setattr(reconstruction.Session, "open", lambda path: opened)
+    monkeypatch.setattr(reconstruction, "reconstruct_session", refuse_scene)
+    order = ReconstructionOrder(
+        session=tmp_path / "s",
+        want=("normals",),
+        out=tmp_path / "out",
+        calibration=None,
+        state="neutral",
+        landmarks=None,
+        truth="",
+        dome=DomeOptions(),
+    )
+    free(1000.0)
+    with pytest.raises(UnusableError, match="reconstruct dome needs about"):
+        next(reconstruction.reconstruct_sessions([order], executor="threads", progress=print))
+
+
+def test_study_without_memory_is_refused_first(tmp_path, free):
+    cases = [SimpleNamespace(rig="dome", size=CaseSize(width_px=width)) for width in (96, 640)]
+    free(2000.0)
+    with pytest.raises(UnusableError, match="dome in 4 processes needs about"):
+        study._require_room(cases, "local:4", tmp_path)
+    study._require_room(cases[:1], "threads", tmp_path)
 
 
 def limit_addresses():

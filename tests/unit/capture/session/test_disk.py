@@ -5,6 +5,7 @@
 """
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,3 +88,8 @@ def test_pipe_is_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SessionDamage, match="not a plain file"):
         read_file(tmp_path / "pipe", limit=5, label="pipe")
+
+
+def test_file_that_cannot_be_read_is_damage():
+    with pytest.raises(SessionDamage, match="expected a readable file"):
+        read_file(Path("/proc/self/mem"), limit=5, label="memory")
