@@ -84,7 +84,7 @@ def test_file_above_limit_is_refused(tmp_path):
         read_file(tmp_path / "a", limit=4, label="a")
 
 
-def test_pipe_is_no_file(tmp_path):
+def test_pipe_is_refused_as_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SessionDamage, match="not a plain file"):
         read_file(tmp_path / "pipe", limit=5, label="pipe")
