@@ -8,9 +8,11 @@ import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -21,9 +23,12 @@ from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
 from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
+from skinrig.errors import EXIT_INTERRUPTED
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
 from skinrig.progress import beat_while_running
+from skinrig.resources.forecast import require_resources_of_tasks
+from skinrig.simulating.simulation import list_tasks
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
 
@@ -91,10 +96,15 @@ def run_demo(
         raise DemoError(f"rigs: got {(*unknown, 'none')[0]!r}, expected names of {', '.join(RIGS)}")
     if seed < 0:
         raise DemoError(f"seed: got {seed}, expected 0 or more")
-    _make_room(out)
-    began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
+    width = {} if width_px is None else {"width_px": width_px}
+    tasks = [
+        task for rig in asked for task in list_tasks(rig, out, **({} if rig == "probe" else width))
+    ]
+    require_resources_of_tasks(tasks, out, processes=at_once, outputs=len(asked), option="")
+    _make_room(out)
+    began = time.perf_counter()
     parts: _Parts = {}
     for rig, part in _run_rigs(asked, (out, seed, width_px, console), at_once):
         parts[rig] = part
@@ -202,17 +212,24 @@ def _run_in_processes(
 ) -> Iterator[tuple[str, _Part]]:
     """Run each rig in its own process; an error in one stops all."""
     pool = ProcessPoolExecutor(
-        at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
+        at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
     )
     try:
-        with _environment(PASSIVE_WAIT_SETTINGS):  # the pool starts its processes on submission
+        # the pool starts its processes on submission
+        with _environment(PASSIVE_WAIT_SETTINGS), _delayed_signals():
             futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
+            pool.submit(os.getpid)  # else the end of the process started last goes unnoticed
         for done in as_completed(futures):
             yield futures[done], done.result()
-    except BaseException:
+    except BaseException as error:
         for process in multiprocessing.active_children():
             process.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
+        if isinstance(error, BrokenProcessPool):
+            raise DemoError(
+                f"a process of the demo was ended by the system, expected it to finish one of "
+                f"{', '.join(rigs)}; run it again with more memory, or rig by rig: --rigs {rigs[0]}"
+            ) from error
         raise
     finally:
         pool.shutdown()
@@ -230,9 +247,31 @@ def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _die_when_interrupted() -> None:
-    """Let SIGINT end this process silently; the parent reports the interruption."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+@contextmanager
+def _delayed_signals() -> Iterator[None]:
+    """Deliver Ctrl-C and SIGTERM after the block; processes started in it inherit their delay."""
+    delayed = {signal.SIGINT, signal.SIGTERM}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, delayed)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends it or ends; Ctrl-C, which is delayed, is the parent's.
+
+    Without the delay, Ctrl-C would show a traceback of each process that is still starting.
+    """
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(EXIT_INTERRUPTED)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _run_rig(

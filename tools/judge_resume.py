@@ -175,8 +175,9 @@ def kill_until_done(
     rng: np.random.Generator,
     again: Sequence[str] = (),
     span: float = 0.5,
+    most: float = np.inf,
 ) -> list[Kill]:
-    """Kill a command at random moments and repeat it until it ends; compare its output."""
+    """Kill a command at random moments, but at `most` times, until it ends; compare its output."""
     seconds, expected = whole
     log = out.with_suffix(".log")
     kills: list[tuple[float, list[tuple[str, float]]]] = []
@@ -187,7 +188,7 @@ def kill_until_done(
         while process.poll() is None and not read_events(log):
             time.sleep(0.02)
         try:
-            code = process.wait(timeout=after_s)
+            code = process.wait(timeout=after_s if len(kills) < most else None)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()

@@ -8,6 +8,7 @@ of the maximum, counted in the worst second, and the rms of its 3 to 65 Hz part 
 are planning figures, not a medical certificate.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,15 +67,15 @@ def eye_signal(
     Returns
     -------
     ndarray
-        (T,), W/m^2.
+        (T,), W/m^2; none without rows.
     """
+    if not rows:
+        return np.zeros(0)
     light = np.array([float(row.light_levels(len(weights)) @ weights) for row in rows])
     ends = np.cumsum([row.dwell_s for row in rows])
-    starts = np.concatenate([[0.0], ends[:-1] - overlap_s]) if len(rows) else ends
+    starts = np.concatenate([[0.0], ends[:-1] - overlap_s])
     # the integral of each row's light up to t is a ramp from its start to its end
-    count = (
-        int(np.ceil((float(ends[-1]) + 2.0 * DARK_PADDING_S) / EYE_SAMPLE_S)) if len(rows) else 0
-    )
+    count = math.ceil((float(ends[-1]) + 2.0 * DARK_PADDING_S) / EYE_SAMPLE_S)
     edges = np.arange(count + 1) * EYE_SAMPLE_S - DARK_PADDING_S
     times = np.concatenate([starts, ends])
     slopes = np.concatenate([light, -light])

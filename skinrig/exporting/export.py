@@ -14,6 +14,7 @@ from skinrig.appearances.dynamic import describe_parts
 from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import ExportResult, export_sealed
+from skinrig.resources.forecast import forecast_resources, measure_folder_mb, require_resources
 
 APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps.write",
@@ -105,6 +106,9 @@ def export(
     require_choice("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
         raise ExportError(f"{out}: exists; choose a new folder [SR-EXP-002]")
+    kind = "session" if to in SESSION_FORMATS else "appearance"
+    need = forecast_resources(f"export {kind}", {"source_mb": measure_folder_mb(source)})
+    require_resources(f"export --to {to}", need, Path(out))
     order = delivery or ExportSettings()
     held: SkinAppearance | Session
     if to in SESSION_FORMATS:

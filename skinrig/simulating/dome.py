@@ -67,9 +67,8 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     require_choice("state", order.state, STATE_NAMES, SimulationError)
     conditions = _conditions(order)
     reference.check_dome_order(order)
-    rig = _rig(order)
-    planned = order.plan if order.target is None else None
-    plan = planned or add_scan(_plan(rig, order.target, order.size), rig)
+    rig, plan = plan_capture(order)
+    driving.require_room(order, rig, plan)
     light = driving.announce_light(plan, rig, order)
     settings = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
@@ -280,6 +279,13 @@ def _rig(order: DomeOrder) -> Rig:
         lights=[x.name for x in dome.lights if x.name in lit],
         views=[v.name for v in dome.views if v.name in used],
     ).resized(width_px)
+
+
+def plan_capture(order: DomeOrder) -> tuple[Rig, Plan]:
+    """Return the dome with the lights, cameras and image size of an order, and the plan."""
+    rig = _rig(order)
+    planned = order.plan if order.target is None else None
+    return rig, planned or add_scan(_plan(rig, order.target, order.size), rig)
 
 
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:

@@ -21,6 +21,12 @@ from rigsim.world import World
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
+from skinrig.resources.forecast import (
+    count_megapixels,
+    forecast_resources,
+    forecast_smaller_widths,
+    require_resources,
+)
 from skinrig.simulating import subject_records
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import (
@@ -157,6 +163,18 @@ def open_session(
         },
         now=None if created is None else (lambda: created),
     )
+
+
+def require_room(order: SimulationOrder, rig: Rig, plan: Plan) -> None:
+    """Raise unless memory and disk suffice for a simulation; voxels of skin are not forecast."""
+    if order.renderer != "mitsuba":
+        return
+    work = f"simulate {order.rig}"
+    amounts = count_megapixels(rig, plan)
+    smaller = {}
+    if hasattr(order, "width_px"):
+        smaller = forecast_smaller_widths(work, rig.views[0].width_px, amounts)
+    require_resources(work, forecast_resources(work, amounts), order.out, smaller=smaller)
 
 
 def announce_light(plan: Plan, rig: Rig, order: SimulationOrder) -> Mapping[str, float | str]:

@@ -25,6 +25,7 @@ from skinrig.simulating.driving import (
     encode_arrays,
     manifest_settings,
     open_session,
+    require_room,
 )
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_offset_mm, build_truth
 from skinrig.simulating.orders import (
@@ -46,13 +47,11 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     target, states = order.target, order.states
     for state in states if target is None else ():
         require_choice("state", state, STATE_NAMES, SimulationError)
-    rig = load_rig("flash")
+    # plan and scenes are built first, so that an error leaves no session folder
+    rig, plan = plan_capture(order)
+    require_room(order, rig, plan)
     is_patch = order.renderer == "reference"
-    width = order.width_px or (MIN_WIDTH_PX if is_patch else WIDTHS_PX[order.size])
-    if is_patch:
-        rig = crop_to_patch(rig, width)
-    elif width != rig.views[0].width_px:
-        rig = rig.resized(width)
+    width = rig.views[0].width_px
     settings = manifest_settings(
         order,
         width_px=width,
@@ -70,9 +69,6 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     texels = subject_records.choose_face_texels(width)
     if target is None and texels != subject_records.FACE_TEXELS:
         settings["texels"] = texels
-    # plan and scenes are built first, so that an error leaves no session folder
-    details = select_attributes(order, "target", "states", "repeats", "bands")
-    plan = order.plan or DefaultPlan(**details).of(rig)
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, settings, first)
@@ -107,6 +103,19 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
         return build_result(order, session, first, rig_seconds, truth)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
+
+
+def plan_capture(order: FlashOrder) -> tuple[Rig, Plan]:
+    """Return the rig at the image size of an order, and the plan; that of a sequence differs."""
+    rig = load_rig("flash")
+    is_patch = order.renderer == "reference"
+    width = order.width_px or (MIN_WIDTH_PX if is_patch else WIDTHS_PX[order.size])
+    if is_patch:
+        rig = crop_to_patch(rig, width)
+    elif width != rig.views[0].width_px:
+        rig = rig.resized(width)
+    details = select_attributes(order, "target", "states", "repeats", "bands")
+    return rig, order.plan or DefaultPlan(**details).of(rig)
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:

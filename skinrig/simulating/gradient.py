@@ -39,13 +39,8 @@ MAX_SHIFT_MM = 0.3
 def simulate_gradient(order: GradientOrder) -> SimulationResult:
     """Simulate a capture with the gradient sphere; see `simulation.simulate`."""
     order = reference.check_gradient_order(order)
-    # the 12 mm ball needs the whole sensor at every size
-    width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
-    rig = load_rig("gradient").cropped(order.width_px or width_px)
-    angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
-    plan = order.plan or DefaultPlan(
-        angles=angles, **select_attributes(order, "target", "steps")
-    ).of(rig)
+    rig, plan = plan_capture(order)
+    driving.require_room(order, rig, plan)
     light = driving.announce_light(plan, rig, order)
     asked = driving.manifest_settings(
         order,
@@ -80,6 +75,16 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         driving.write_truth(truth, order, session, ground_truth(scene, grips), files=files)
     log.remove()
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
+
+
+def plan_capture(order: GradientOrder) -> tuple[Rig, Plan]:
+    """Return the rig at the image size of an order, and the plan."""
+    # the 12 mm ball needs the whole sensor at every size
+    width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
+    rig = load_rig("gradient").cropped(order.width_px or width_px)
+    angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
+    details = select_attributes(order, "target", "steps")
+    return rig, order.plan or DefaultPlan(angles=angles, **details).of(rig)
 
 
 def make_scene(

@@ -30,9 +30,8 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
     Both sizes have all sites, brackets and pixels, which are fast to simulate; "full" traces more
     photons for the ground truth.
     """
-    rig = load_rig("probe")
-    asked_plan = DefaultPlan(**select_attributes(order, "target", "sites", "repeats", "angles"))
-    plan = order.plan or asked_plan.of(rig)
+    rig, plan = plan_capture(order)
+    driving.require_room(order, rig, plan)
     asked = driving.manifest_settings(
         order,
         sites=",".join(order.sites or PROBE_SITES),
@@ -55,6 +54,13 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
         driving.write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
+
+
+def plan_capture(order: ProbeOrder) -> tuple[Rig, Plan]:
+    """Return the rig and the plan of an order."""
+    rig = load_rig("probe")
+    details = select_attributes(order, "target", "sites", "repeats", "angles")
+    return rig, order.plan or DefaultPlan(**details).of(rig)
 
 
 def _build_scene(rig: Rig, plan: Plan, order: ProbeOrder) -> Any:

@@ -26,6 +26,7 @@ from skinrig.simulating.driving import (
     build_result,
     drive_plan,
     open_session,
+    require_room,
     require_unfinished,
     session_settings,
 )
@@ -91,11 +92,12 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         )
     else:
         course = EventCourse(sequence.state, constant_s)
+    plan = sequence_plan(rig, sequence)
+    require_room(order, rig, plan)
     subject = subject_file.load_subject(order.subject)
     texels = subject_records.choose_face_texels(width)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
-    plan = sequence_plan(rig, sequence)
     if order.progress is not None:
         for line in sequence_lines(plan):
             order.progress(line)

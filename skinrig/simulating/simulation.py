@@ -4,6 +4,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+from skinrig.resources.forecast import Task, count_megapixels
 from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
 from skinrig.simulating.resumption import SessionComplete
 
@@ -28,6 +29,20 @@ def simulate(order: SimulationOrder) -> SimulationResult:
     except SessionComplete as complete:
         return complete.result
     return done
+
+
+def list_tasks(rig: str, out: Path, **options: Any) -> list[Task]:
+    """Return a simulation and a reconstruction, to forecast their memory.
+
+    Parameters
+    ----------
+    rig, out, options
+        As in `simulate_session`.
+    """
+    planner = importlib.import_module(f"skinrig.simulating.{rig}")
+    planned = planner.plan_capture(order_for(rig, out=out, **options))
+    amounts = count_megapixels(*planned)
+    return [Task(f"{command} {rig}", amounts) for command in ("simulate", "reconstruct")]
 
 
 def simulate_session(rig: str, out: str | Path, **options: Any) -> SimulationResult:

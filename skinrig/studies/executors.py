@@ -58,6 +58,18 @@ def check_executor(text: str) -> str:
     return text
 
 
+def count_local_processes(text: str) -> int:
+    """Return how many processes of this machine an executor uses; 0: those of other machines.
+
+    Examples
+    --------
+    >>> count_local_processes("local:4"), count_local_processes("threads")
+    (4, 1)
+    """
+    local = _LOCAL.fullmatch(text)
+    return int(local[1]) if local else int(text == SERIAL_EXECUTOR)
+
+
 @contextmanager
 def open_executor(text: str) -> Iterator[Executor | None]:
     """Yield the executor of a text; None for `SERIAL_EXECUTOR`, where the caller runs its tasks.

@@ -6,12 +6,21 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from capture.plan.rig_kinds import find_rig_kind
+from capture.session import Session, SessionError
 from reconstruction.pipeline import recipes
 from reconstruction.pipeline.inputs import DomeOptions
 from reconstruction.tiles import map_tiles
 from skinrig.errors import UnusableError
+from skinrig.resources.forecast import Task, count_megapixels, require_resources_of_tasks
 from skinrig.studies.description import require_software, software_hash
-from skinrig.studies.executors import ExecutorLost, describe_lost_task, ended_workers, open_executor
+from skinrig.studies.executors import (
+    ExecutorLost,
+    count_local_processes,
+    describe_lost_task,
+    ended_workers,
+    open_executor,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +95,24 @@ def _reconstruct_on_worker(order: ReconstructionOrder, software: str) -> Reconst
     return reconstruct_session(order)
 
 
+def _require_room(orders: Sequence[ReconstructionOrder], executor: str) -> None:
+    """Raise unless memory and disk suffice; images under lights of a list are not forecast.
+
+    A session that cannot be read here is refused when its own turn comes.
+    """
+    tasks = []
+    for order in orders:
+        try:
+            session = Session.open(order.session)
+        except SessionError:
+            continue
+        if "light_list" not in session.manifest.extra:
+            work = f"reconstruct {find_rig_kind(session.rig)}"
+            tasks.append(Task(work, count_megapixels(session.rig, session.plan)))
+    processes = count_local_processes(executor)
+    require_resources_of_tasks(tasks, orders[0].out, processes=processes, outputs=len(tasks))
+
+
 def reconstruct_sessions(
     orders: Sequence[ReconstructionOrder],
     *,
@@ -111,6 +138,7 @@ def reconstruct_sessions(
     skinrig.errors.UnusableError
         If a session ends its workers, or a worker has other software than this process.
     """
+    _require_room(orders, executor)
     with open_executor(executor) as pool:
         if pool is None:
             for order in orders:

@@ -3,12 +3,14 @@
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from skinrig.resources.forecast import Task, require_resources_of_tasks
+from skinrig.simulating.simulation import list_tasks
 from skinrig.studies import results
 from skinrig.studies.cases import (
     WORK_FOLDER,
@@ -25,6 +27,7 @@ from skinrig.studies.executors import (
     SERIAL_EXECUTOR,
     ExecutorLost,
     check_executor,
+    count_local_processes,
     describe_lost_task,
     open_executor,
 )
@@ -84,6 +87,7 @@ def run_study(
     cases = {case.key(software): case for case in study.list_cases()}
     out = out.absolute()
     with _lock(out):
+        _require_room(cases.values(), executor, out)
         done = {key: found for key in cases if (found := read_record(out, key)) is not None}
         one_thread = executor != SERIAL_EXECUTOR
         orders = [
@@ -123,6 +127,16 @@ def run_study(
         )
         results.write_results(study.title, run.cases, run.quantities, run.errors, out)
     return run
+
+
+def _require_room(cases: Iterable[Case], executor: str, out: Path) -> None:
+    """Raise unless memory and disk suffice for the largest of the cases."""
+    tasks: list[Task] = []
+    for rig, size in dict.fromkeys((case.rig, case.size) for case in cases):
+        given = {name: n for name, n in asdict(size).items() if n is not None}
+        tasks += list_tasks(rig, out, **given)
+    processes = count_local_processes(executor)
+    require_resources_of_tasks(tasks, out, processes=processes, outputs=processes)
 
 
 def _run_orders(orders: Sequence[CaseOrder], executor: str) -> Iterator[CaseOutcome]:

@@ -1,13 +1,13 @@
 """A reconstruction that is killed and repeated ends with the bytes of an undisturbed one.
 
-`SKINRIG_KILLS` sets the number of kills, and `SKINRIG_DEMO` a folder of `skinrig demo`, whose four
-rigs and two simulations are then killed in turn.
+`tools/judge_resume.py` kills reconstructions of all rigs, and simulations, more often.
 """
 
 import importlib.util
-import os
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from reconstruction.pipeline import recipes
@@ -15,6 +15,7 @@ from skinrig.cli import main
 
 ROOT = Path(__file__).parents[2]
 MAPS = ("melanin", "hemoglobin", "diffuse", "specular", "tsumura_melanin")
+N_KILLS = 2
 pytestmark = pytest.mark.long
 
 
@@ -35,22 +36,33 @@ def session(tmp_path_factory):
     return out
 
 
-@pytest.mark.timeout(3600)
-def test_commands_killed_at_random_end_with_same_bytes(tool, session, tmp_path, monkeypatch):
-    demo = Path(os.environ.get("SKINRIG_DEMO", session.parent))
-    names = [*tool.RECONSTRUCTIONS, *tool.SIMULATIONS]
-    if demo == session.parent:
-        names = ["flash"]
-        monkeypatch.setitem(tool.RECONSTRUCTIONS, "flash", (session.name, "", ",".join(MAPS)))
-    kills = tool.judge(demo, tmp_path, names, int(os.environ.get("SKINRIG_KILLS", "2")), seed=1)
+@pytest.fixture(scope="module")
+def command(session):
+    return ["reconstruct", str(session), "--maps", ",".join(MAPS)]
+
+
+@pytest.fixture(scope="module")
+def whole(tool, command, tmp_path_factory):
+    """Return the seconds of an undisturbed run with its kernels compiled, and its files."""
+    out = tmp_path_factory.mktemp("whole")
+    for name in ("compile", "judge"):
+        begun_s = time.perf_counter()
+        assert main([*command, "--out", str(out / name)]) == 0
+    return time.perf_counter() - begun_s, tool.hash_folder(out / name)
+
+
+def test_killed_reconstruction_ends_with_same_bytes(tool, command, whole, tmp_path):
+    out = tmp_path / "out"
+    run, rng = [*command, "--out", str(out)], np.random.default_rng(1)
+    kills = tool.kill_until_done("flash", run, out, whole=whole, rng=rng, most=N_KILLS)
+    assert kills
     assert all(kill.same for kill in kills)
     assert all(kill.interrupted <= 1 for kill in kills)
 
 
-def test_reconstruct_interrupted_everywhere_ends_with_same_bytes(tool, session, tmp_path):
+def test_reconstruct_interrupted_everywhere_ends_with_same_bytes(tool, session, whole, tmp_path):
     """Each run computes one part and takes up all earlier ones from the work folder."""
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    recipes.reconstruct(session, want=MAPS, out=whole)
+    out = tmp_path / "out"
     begun, runs = [], 0
 
     def stop_at_second(text, left_s):
@@ -61,9 +73,11 @@ def test_reconstruct_interrupted_everywhere_ends_with_same_bytes(tool, session, 
     while not out.exists():
         earlier, runs = set(begun), runs + 1
         try:
-            recipes.reconstruct(session, want=MAPS, out=out, progress=stop_at_second)
+            recipes.reconstruct(
+                session, want=MAPS, out=out, progress=stop_at_second, truth="truth-session"
+            )
         except KeyboardInterrupt:
             assert (tmp_path / ".out.work").is_dir()
     assert runs >= 4
-    assert tool.hash_folder(out) == tool.hash_folder(whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+    assert tool.hash_folder(out) == whole[1]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -107,6 +107,12 @@ def test_leds_go_out_by_themselves_and_by_command(bench):
     assert not box.status().lit
 
 
+def test_listening_for_no_time_asks_nothing(bench):
+    asked = bench.box.port.statistics.requests
+    assert bench.box.listen(0.0) == {}
+    assert bench.box.port.statistics.requests == asked
+
+
 def test_flicker_is_refused_until_eye_safety_confirmation(bench):
     box = bench.box
     box.arm()

@@ -129,8 +129,10 @@ def test_retry_sends_same_bytes_after_newline(open_port):
         (ask(8, "FLAS:FIRE a", retry=True), b""),
         (ask(8, "FLAS:FIRE a", retry=True), say(8, "done")),
     )
+    frames = port.statistics.frames
     assert port.ask("FLAS:FIRE a") == "done"
     assert port.statistics.retries == 2
+    assert port.statistics.frames == frames + 3
 
 
 def test_nak_triggers_immediate_retry(open_port):
@@ -322,3 +324,38 @@ def test_first_numbers_differ_from_run_to_run(monkeypatch):
 def test_settings_that_make_no_sense_are_refused(field, value):
     with pytest.raises(ValueError, match=field):
         Port("/dev/box", **{field: value})
+
+
+def greet(seq):
+    return (b"\n" + encode(Request(seq, 0, "SYST:HELLO?")), encode(Reply(seq, 0x9F3A, 0, HELLO)))
+
+
+def test_hello_forgets_half_a_line(open_port):
+    port = open_port((ask(8, "STAT?"), say(8, "0") + b"=9:9f3a 0 half"), greet(9))
+    assert port.ask("STAT?") == "0"
+    port.hello()
+    assert port.statistics.retries == 0
+
+
+def test_hello_of_another_thread_is_refused(open_port):
+    port, raised = open_port(), []
+
+    def greet_elsewhere():
+        try:
+            port.hello()
+        except RuntimeError as error:
+            raised.append(str(error))
+
+    thread = threading.Thread(target=greet_elsewhere)
+    thread.start()
+    thread.join()
+    assert ["used by two threads" in one for one in raised] == [True]
+
+
+def test_reopened_port_keeps_its_address_or_takes_another(open_port):
+    port = open_port(greet(8), greet(9))
+    port.reopen()
+    assert port.line.closed
+    assert port.url == "/dev/box"
+    port.reopen("/dev/other")
+    assert port.url == "/dev/other"

@@ -172,3 +172,16 @@ def test_a_terminal_may_send_carriage_returns():
 )
 def test_damaged_frame_differs_from_bare_line(line, meant):
     assert wire.is_frame_like(line) is meant
+
+
+@pytest.mark.parametrize("code", [-10_000, 10_000])
+def test_reply_code_outside_four_digits_is_refused(code):
+    assert Reply(1, 0, 9999).code == -Reply(1, 0, -9999).code
+    with pytest.raises(ValueError, match="-9999 to 9999"):
+        Reply(1, 0, code)
+
+
+@pytest.mark.parametrize("name", ["", "trip", "WDOG!"])
+def test_event_name_is_upper_case(name):
+    with pytest.raises(ValueError, match="upper-case words"):
+        Event(1, 0, name)

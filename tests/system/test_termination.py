@@ -1,10 +1,11 @@
-"""Interrupted and terminated commands: exit code 130, and no temporary folder is left."""
+"""Ended commands: exit code 130, and neither a temporary folder nor a process is left."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -37,6 +38,69 @@ def test_ended_command_leaves_no_temporary_folder(tmp_path, number):
     assert "interrupted" in said
     assert "Traceback" not in said
     assert list(tmp_path.iterdir()) == []
+
+
+def list_children(pid):
+    """Return the processes that a process has started."""
+    try:
+        return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def is_worker(pid):
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+ENDINGS = {
+    "first child killed": (0, signal.SIGKILL, errors.EXIT_BAD_INPUT, "ended by the system"),
+    "last child killed": (-1, signal.SIGKILL, errors.EXIT_BAD_INPUT, "ended by the system"),
+    "terminated": (None, signal.SIGTERM, errors.EXIT_INTERRUPTED, "interrupted"),
+    "killed": (None, signal.SIGKILL, -signal.SIGKILL, ""),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_ended_demo_leaves_no_process(ending, tmp_path):
+    who, number, code, text = ENDINGS[ending]
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    argv = ["demo", "--rigs", "flash,probe", "--out", str(tmp_path / "demo")]
+    with subprocess.Popen(
+        [sys.executable, "-m", "skinrig", *argv],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        last_s = time.monotonic() + TIMEOUT_S
+        while len(workers := [*filter(is_worker, list_children(process.pid))]) < 2:
+            assert process.poll() is None
+            assert time.monotonic() < last_s
+            time.sleep(0.02)
+        children = list_children(process.pid)
+        os.kill(process.pid if who is None else workers[who], number)
+        _, said = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == code
+    assert text in said
+    assert "Traceback" not in said
+    last_s = time.monotonic() + TIMEOUT_S
+    while any(map(is_alive, children)) and time.monotonic() < last_s:
+        time.sleep(0.05)
+    assert not [pid for pid in children if is_alive(pid)]
+    if ending != "killed":
+        assert list(temporary.iterdir()) == []
 
 
 def test_lack_of_memory_is_not_a_defect():

@@ -5,13 +5,15 @@
 """
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from capture import raw
 from capture.calibration import store as calibration_store
-from capture.session.disk import Disk
+from capture.session.disk import Disk, read_file
+from capture.session.errors import SessionDamage
 
 
 @pytest.fixture
@@ -62,3 +64,32 @@ def test_invalid_descriptor_is_refused(tmp_path):
     os.close(descriptor)
     with pytest.raises(OSError, match="descriptor"):
         Disk().fsync(descriptor)
+
+
+def test_second_writer_gets_no_lock(tmp_path):
+    disk = Disk()
+    disk.close(disk.create(tmp_path / "journal"))
+    first, second = (disk.open_append(tmp_path / "journal") for _ in range(2))
+    assert disk.lock(first) is True
+    assert disk.lock(second) is False
+    disk.close(first)
+    assert disk.lock(second) is True
+    disk.close(second)
+
+
+def test_file_above_limit_is_refused(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_file(tmp_path / "a", limit=5, label="a") == b"12345"
+    with pytest.raises(SessionDamage, match="got 5 bytes, expected at most 4"):
+        read_file(tmp_path / "a", limit=4, label="a")
+
+
+def test_pipe_is_refused_as_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SessionDamage, match="not a plain file"):
+        read_file(tmp_path / "pipe", limit=5, label="pipe")
+
+
+def test_file_that_cannot_be_read_is_damage():
+    with pytest.raises(SessionDamage, match="expected a readable file"):
+        read_file(Path("/proc/self/mem"), limit=5, label="memory")

@@ -1,0 +1,1 @@
+"""Memory and disk of long work: forecasts, and what is free."""

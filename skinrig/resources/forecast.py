@@ -1,0 +1,248 @@
+"""Forecast memory and disk of long work, and refuse work that does not fit before it begins.
+
+Forecasts are linear in the sizes of the work. `tools/measure_memory.py` measured what the
+coefficients in `data/memory.toml` are set on.
+"""
+
+import shutil
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+from capture.plan import Plan
+from capture.rig import Rig
+from skinrig.errors import UnusableError
+from skinrig.resources.free_memory import MEMORY_VARIABLE, FreeMemory, read_free_memory
+
+MEMORY_TABLE: Final = resources.files("skinrig").joinpath("data/memory.toml")
+
+
+Amounts = Mapping[str, float]
+"""Sizes that memory and disk depend on: "camera_mp" and "frame_mp", megapixels of the cameras and
+of all frames; "source_mb", bytes of the folder to be exported."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceForecast:
+    """Forecast peaks of one process, MB."""
+
+    memory_mb: float
+    """Peak resident memory."""
+    space_mb: float
+    """Peak address space, which `ulimit -v` limits."""
+    disk_mb: float
+    """Files of the output."""
+
+    def fits(self, free: FreeMemory) -> bool:
+        """Return whether the memory of a process is below what it can have.
+
+        Examples
+        --------
+        >>> need = ResourceForecast(500.0, 1300.0, 2.0)
+        >>> need.fits(FreeMemory(600.0, "machine", math.inf))
+        True
+        >>> need.fits(FreeMemory(600.0, "machine", 1000.0))
+        False
+        """
+        return self.memory_mb <= free.memory_mb and self.space_mb <= free.space_mb
+
+
+def count_megapixels(rig: Rig, plan: Plan) -> Amounts:
+    """Return the megapixels of the cameras in use, and of all frames of a plan.
+
+    Examples
+    --------
+    >>> from capture.plan import flash_plan
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("flash").resized(128)
+    >>> {name: round(number, 3) for name, number in count_megapixels(rig, flash_plan(rig)).items()}
+    {'camera_mp': 0.011, 'frame_mp': 0.066}
+    """
+    megapixels = {view.name: view.width_px * view.height_px * 1e-6 for view in rig.all_views}
+    used = {name for step in plan.steps for name in step.cameras}
+    return {
+        "camera_mp": sum(megapixels[name] for name in used),
+        "frame_mp": sum(megapixels[name] for step in plan.steps for name in step.cameras),
+    }
+
+
+def forecast_resources(
+    work: str, amounts: Amounts, *, processes: int = 1, outputs: int = 1
+) -> ResourceForecast:
+    """Forecast memory and disk of a command.
+
+    Parameters
+    ----------
+    work
+        Command, and rig where the command depends on it, such as "simulate flash".
+    amounts
+        Sizes of one process's work.
+    processes
+        Processes that do such work at once.
+    outputs
+        Such outputs that are written.
+
+    Examples
+    --------
+    >>> one, two = (forecast_resources("simulate probe", {}, processes=n) for n in (1, 2))
+    >>> two.memory_mb == 2.0 * one.memory_mb > 0.0
+    True
+    """
+    row: Mapping[str, Any] = _read_table()
+    for word in work.split():
+        row = row[word]
+    memory_mb, disk_mb = (
+        one["fixed"] + sum(number * one.get(name, 0.0) for name, number in amounts.items())
+        for one in (row["memory_mb"], row["disk_mb"])
+    )
+    space_mb = memory_mb + row["space_above_memory_mb"]
+    return ResourceForecast(memory_mb * processes, space_mb, disk_mb * outputs)
+
+
+def forecast_smaller_widths(
+    work: str, width_px: int, amounts: Amounts
+) -> dict[str, ResourceForecast]:
+    """Forecast a simulation at a half, a quarter, and an eighth of its width, by option.
+
+    Examples
+    --------
+    >>> list(forecast_smaller_widths("simulate flash", 1000, {"camera_mp": 0.7}))
+    ['--width 500', '--width 250', '--width 124']
+    """
+    found = {}
+    for divisor in (2, 4, 8):
+        fewer = {name: number / divisor**2 for name, number in amounts.items()}
+        found[f"--width {width_px // divisor // 2 * 2}"] = forecast_resources(work, fewer)
+    return found
+
+
+def measure_folder_mb(folder: str | Path) -> float:
+    """Return the bytes of all files of a folder, MB.
+
+    Examples
+    --------
+    >>> measure_folder_mb("no such folder")
+    0.0
+    """
+    files = Path(folder).rglob("*")
+    return sum(path.stat().st_size for path in files if path.is_file()) * 1e-6
+
+
+@cache
+def _read_table() -> dict[str, dict[str, Any]]:
+    return tomllib.loads(MEMORY_TABLE.read_text(encoding="utf-8"))
+
+
+def require_resources(
+    work: str,
+    need: ResourceForecast,
+    out: Path,
+    *,
+    smaller: Mapping[str, ResourceForecast] | None = None,
+) -> None:
+    """Raise unless memory and disk suffice for a forecast.
+
+    Parameters
+    ----------
+    work
+        What is about to begin, for the message.
+    need
+        Its forecast, for all its processes.
+    out
+        Output, whose disk is tried.
+    smaller
+        Forecasts of smaller work by the option that orders it, the largest first. The message names
+        the first that fits.
+
+    Raises
+    ------
+    skinrig.errors.UnusableError
+        With what is needed, what is free, and what to do.
+    """
+    free = read_free_memory()
+    if not need.fits(free):
+        if need.memory_mb > free.memory_mb:
+            lack = f"{_gb(need.memory_mb)}, {_gb(free.memory_mb)} free ({free.source})"
+            advice = f"close other programs, or set {MEMORY_VARIABLE} to the GB that it may use"
+        else:
+            advice = "raise the limit"
+            lack = f"{_gb(need.space_mb)} of addresses, {_gb(free.space_mb)} allowed (ulimit -v)"
+        raise UnusableError(
+            f"memory: {work} needs about {lack}; nothing was computed: "
+            + _advise_smaller(smaller or {}, free)
+            + f"{advice} [SR-CLI-016]"
+        )
+    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    free_mb = shutil.disk_usage(place).free * 1e-6
+    if need.disk_mb > free_mb:
+        raise UnusableError(
+            f"--out: {out}: {work} writes about {_gb(need.disk_mb)}, {_gb(free_mb)} free; nothing "
+            "was computed: free space, or name another disk [SR-CLI-017]"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Work of one process, as in `forecast_resources`."""
+
+    work: str
+    amounts: Amounts
+
+
+def require_resources_of_tasks(
+    tasks: Iterable[Task],
+    out: Path,
+    *,
+    processes: int,
+    outputs: int,
+    option: str = "--executor local:",
+) -> None:
+    """Raise unless memory and disk suffice for the largest of some tasks in each process.
+
+    Parameters
+    ----------
+    tasks
+        Tasks; without any nothing is required.
+    out
+        Output, whose disk is tried.
+    processes
+        Processes of this machine that do the tasks; 0: those of other machines do.
+    outputs
+        Outputs that are on the disk at once.
+    option
+        Option that sets the number of processes, without the number; empty: there is none.
+
+    Raises
+    ------
+    skinrig.errors.UnusableError
+        With what is needed, what is free, and what to do.
+    """
+    largest = max(
+        tasks, key=lambda task: forecast_resources(task.work, task.amounts).memory_mb, default=None
+    )
+    if largest is None or processes == 0:
+        return
+
+    def forecast(count: int) -> ResourceForecast:
+        work, amounts = largest.work, largest.amounts
+        return forecast_resources(work, amounts, processes=count, outputs=outputs)
+
+    fewer = range(processes - 1, 0, -1) if option else ()
+    smaller = {f"{option}{n}": forecast(n) for n in fewer}
+    many = f" in {processes} processes" if processes > 1 else ""
+    require_resources(largest.work + many, forecast(processes), out, smaller=smaller)
+
+
+def _advise_smaller(smaller: Mapping[str, ResourceForecast], free: FreeMemory) -> str:
+    for option, need in smaller.items():
+        if need.fits(free):
+            return f"{option} needs {_gb(need.memory_mb)}; else "
+    return ""
+
+
+def _gb(mb: float) -> str:
+    return f"{mb / 1000:.2g} GB" if mb < 99_500 else f"{mb / 1000:.0f} GB"
