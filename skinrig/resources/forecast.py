@@ -4,6 +4,7 @@ Forecasts are linear in the sizes of the work. `tools/measure_memory.py` measure
 coefficients in `data/memory.toml` are set on.
 """
 
+import math
 import shutil
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -96,7 +97,11 @@ def forecast_resources(
     for word in work.split():
         row = row[word]
     memory_mb, disk_mb = (
-        one["fixed"] + sum(number * one.get(name, 0.0) for name, number in amounts.items())
+        one["fixed"]
+        + min(
+            sum(number * one.get(name, 0.0) for name, number in amounts.items()),
+            one.get("growth_limit", math.inf),
+        )
         for one in (row["memory_mb"], row["disk_mb"])
     )
     space_mb = memory_mb + row["space_above_memory_mb"]

@@ -174,6 +174,17 @@ def test_export_without_memory_is_refused_first(tmp_path, free, capsys):
     assert "export --to maps needs about" in capsys.readouterr().err
 
 
+def test_full_dome_needs_no_more_than_files_keep():
+    """Samples above 1 GiB go to files: 5,000 frames need hardly more memory than 300."""
+    few, many = (
+        resources.forecast_resources("reconstruct dome", {"frame_mp": frames * 1.34})
+        for frames in (300, 5000)
+    )
+    assert many.memory_mb == pytest.approx(3080.0)
+    assert many.memory_mb == few.memory_mb
+    assert many.disk_mb > 10 * few.disk_mb
+
+
 def test_reconstruction_without_memory_is_refused_first(tmp_path, free, monkeypatch):
     rig = load_rig("dome")
     opened = SimpleNamespace(manifest=SimpleNamespace(extra={}), rig=rig, plan=dome_plan(rig))
