@@ -256,7 +256,10 @@ def _is_viewable(path: Path, appearance: Mapping[str, Any]) -> bool:
     if {"melanin", "hemoglobin"} <= maps.keys():  # landmarks map them to the head
         truth = str(parameters.get("truth") or "")
         return bool(truth) and (path.parent / truth / "appearance.json").is_file()
-    return any(name.split("_")[0] in ("normals", "translucency") for name in maps)
+    if "translucency" in maps:
+        return True
+    of_image = "mesh.obj" not in files and "position" not in maps
+    return of_image and any(name.split("_")[0] == "normals" for name in maps)
 
 
 def _permits_research(appearance: Mapping[str, Any]) -> bool:

@@ -143,6 +143,8 @@ MAX_PEOPLE = 6
 MESH_FILE: Final = "mesh.obj"
 ALBEDO_MAP: Final = "r_d"
 TRANSLUCENCY_MAP: Final = "translucency"
+POSITION_MAP: Final = "position"
+"""Of texels on a mesh: normals beside it are those of the mesh, not of an image."""
 CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic", "flash", "probe")
 """Kinds of folders in order of preference for the geometry."""
 PICTURE_KIND: Final = "picture"
@@ -387,7 +389,8 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
         return "flash"
     if TRANSLUCENCY_MAP in appearance.maps:
         return "probe"
-    if find_states(appearance):
+    of_image = MESH_FILE not in appearance.files and POSITION_MAP not in appearance.maps
+    if of_image and find_states(appearance):
         return PICTURE_KIND
     raise SceneError(
         f"{path}: got {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "

@@ -90,13 +90,8 @@ def build_picture_scene(
             np.stack([_unit_slopes(one) for one in packed]).astype(np.float32), "u16"
         )
     }
-    facts: dict[str, Any] = {
-        "states": list(states),
-        "aspect": shape[1] / shape[0],
-        "pixels": [shape[1], shape[0]],
-        "pixel_um": _pixel_um(appearance),
-        "measured_roughness": _roughness(appearance),
-    }
+    facts: dict[str, Any] = {"states": list(states), "aspect": shape[1] / shape[0]}
+    roughness = _roughness(appearance)
     progress("color and uncertainty")
     left_out = [("shadows and interreflection", "a picture has normals, not a surface")]
     color = _stack_maps(appearance, states, COLOR_MAPS, shape)
@@ -114,7 +109,7 @@ def build_picture_scene(
         # square roots: eight bits are finer in the dark, where the eye is
         shown = np.sqrt(np.clip(values / white, 0.0, 1.0))
         textures["picture_color"] = Texture(shown.astype(np.float32), "u8")
-        facts |= {"color_map": name, "color_white": white}
+        facts["color_map"] = name
     extra = _layers_of(appearance, states, maps, size, shape)
     if extra:
         facts["layers"] = {name: [float(v.min()), float(v.max())] for name, v in extra.items()}
@@ -122,7 +117,7 @@ def build_picture_scene(
             f"picture_{name}": Texture(values[..., None].astype(np.float32), "u16")
             for name, values in extra.items()
         }
-    if facts["measured_roughness"] is None:
+    if roughness is None:
         left_out.append(("roughness", f"not measured; {DEFAULT_ROUGHNESS:g} is the first setting"))
     provenance = {"source": appearance.source, "kind": "picture", "appearances": [path.name]}
     agreed = consent.merge_consent(appearance)
@@ -135,7 +130,7 @@ def build_picture_scene(
             np.array([[0, 0], [1, 0], [0, 1]], np.float32),
         ),
         textures=textures,
-        params={"picture_roughness": facts["measured_roughness"] or DEFAULT_ROUGHNESS},
+        params={"picture_roughness": DEFAULT_ROUGHNESS if roughness is None else roughness},
         facts={"picture": facts},
         provenance=provenance,
         left_out=tuple(left_out),
@@ -200,7 +195,7 @@ def _layers_of(
     if all(one.stderr is not None for one in normals):
         out["normal_stderr_deg"] = np.stack(
             [
-                np.degrees(_reduce(one, size, np.linalg.norm(one.stderr, axis=-1)))[..., 0]
+                np.degrees(_reduce(one, size, _angle_stderr_rad(one.values, one.stderr)))[..., 0]
                 for one in normals
                 if one.stderr is not None
             ]
@@ -208,9 +203,16 @@ def _layers_of(
     return out
 
 
-def _pixel_um(appearance: SkinAppearance) -> float | None:
-    found = appearance.parameters.get("pixel_um")
-    return float(found) if isinstance(found, int | float) else None
+def _angle_stderr_rad(normals: FloatArray, stderr: FloatArray) -> Float64Array:
+    """Return the standard error of the angle of unit normals, (H, W), rad.
+
+    Channels hold the errors of the components, or three times that of a tangential axis.
+    """
+    squares = np.square(stderr, dtype=np.float64)
+    repeated = (np.ptp(stderr, axis=-1) == 0.0)[..., None]
+    # the direction of the normal has no error of its own
+    axes = np.where(repeated, 1.0 - np.square(normals, dtype=np.float64), 1.0)
+    return np.asarray(np.sqrt((squares * axes).sum(axis=-1)))
 
 
 def _roughness(appearance: SkinAppearance) -> float | None:

@@ -86,7 +86,7 @@ def test_states_slopes_and_readings_follow_controls(picture):
     np.testing.assert_allclose(kept[kept[..., 3] > 0.99][:, 2], 1.0, atol=1e-3)
     picture.set(picture_slopes=1)
     rows = dict(picture.page.evaluate("() => window.viewer.readings(32, 32)"))
-    assert rows["Its standard error"] == f"{np.degrees(0.01 * np.sqrt(3.0)):.2f}°"
+    assert rows["Its standard error"] == f"{np.degrees(0.01 * np.sqrt(2.0)):.2f}°"
     assert picture.page.evaluate("() => window.viewer.readings(0, 0)") == []
     assert picture.problems == []
 
@@ -102,3 +102,22 @@ def test_dragging_turns_the_light(picture):
     now = picture.page.evaluate("() => window.viewer.params")
     assert now["light_azimuth_deg"] > 5
     assert now["light_elevation_deg"] > 3
+
+
+def test_reset_and_comparison_keep_pictures_together(picture):
+    start = picture.page.evaluate("() => window.viewer.params")
+    picture.page.get_by_role("button", name="Store as B").click()
+    picture.set(picture_slopes=3, picture_x=0.3, picture_zoom=2)
+    stored = picture.page.evaluate("() => window.viewer.params")["compare"]
+    assert stored["picture_slopes"] == start["picture_slopes"]
+    assert not {"picture_x", "picture_zoom"} & set(stored)  # both sides move together
+    picture.page.get_by_role("button", name="Reset").click()
+    now = picture.page.evaluate("() => window.viewer.params")
+    assert (now["picture_slopes"], now["picture_x"], now["compare"]) == (1, 0.5, None)
+    picture.page.locator("#port").focus()
+    picture.page.keyboard.press("o")
+    picture.page.keyboard.press("ArrowRight")
+    assert picture.page.evaluate("() => window.viewer.params")["picture_x"] < 0.5  # moves right
+    picture.page.keyboard.press("r")
+    picture.page.keyboard.press("l")
+    assert picture.problems == []

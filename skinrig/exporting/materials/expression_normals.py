@@ -10,11 +10,11 @@ import numpy as np
 
 from model import wrinkles
 from model.skin import SkinAppearance
-from model.texture_resampling import resample
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from skinrig.appearances.dynamic import WRINKLES, describe_parts
 from skinrig.arrays import Float32Array
 from skinrig.exporting.materials.material import Material
+from skinrig.exporting.options import ExportError
 
 NEUTRAL_VARIANT: Final = "neutral"
 """Name of the variant without wrinkles."""
@@ -39,6 +39,11 @@ def expression_normals(appearance: SkinAppearance, material: Material) -> dict[s
     dict of str to ndarray of float32
         Unit normals (H, W, 3), +Y up, by expression; empty without wrinkles. A texel without a
         measured wrinkle keeps the neutral normal.
+
+    Raises
+    ------
+    ExportError
+        If the wrinkles have another size.
     """
     part = describe_parts(appearance).get(WRINKLES)
     if part is None:
@@ -51,7 +56,9 @@ def expression_normals(appearance: SkinAppearance, material: Material) -> dict[s
         moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
         moved = np.where(shown.valid[..., None], moved, 0.0)
         if moved.shape != neutral.shape:
-            size = (neutral.shape[0], neutral.shape[1])
-            moved = np.asarray(resample(moved, size), np.float64)
+            raise ExportError(
+                f"wrinkles of {name}: got {moved.shape[:2]} texels, expected the normals' "
+                f"{neutral.shape[:2]}; fit them to maps of this size"
+            )
         found[str(name)] = wrinkles.decode(neutral + moved).astype(np.float32)
     return found

@@ -7,6 +7,7 @@ from datetime import date
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from capture.calibration.record import Calibration, CalibrationError
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import hash_file
 from skinrig.arrays import Float64Array
+from skinrig.console import format_count
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
 
@@ -164,9 +166,13 @@ def _age(
     )
 
 
+DRIFT_SIGMAS: Final = 3.0
+"""Least change of a calibration, in its standard errors, that is stated."""
+
+
 @cache
 def _drifts() -> list[tuple[str, str, int, float, float]]:
-    """Return rig, kind, age in days, rms change in standard errors or 0, and median change in %."""
+    """Return rig, kind, age in days, typical change in standard errors or 0, and median in %."""
     text = resources.files("skinrig").joinpath("data/calibration_drift.csv").read_text()
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     return [
@@ -194,12 +200,15 @@ def describe_drift(rig: str, kind: str, age_days: int) -> str:
     Returns
     -------
     str
-        Empty for kinds that were not measured.
+        Empty for kinds that were not measured. One pair of calibrations was measured per age, so
+        that a change below `DRIFT_SIGMAS` standard errors is none.
 
     Examples
     --------
-    >>> describe_drift("dome", "lights", 400).endswith("at 365 days")
-    True
+    >>> describe_drift("dome", "lights", 400)
+    '1.5 %, 8.5 standard errors, in 365 days'
+    >>> describe_drift("probe", "fiber", 400)
+    'none beyond noise'
     >>> describe_drift("flash", "color", 3)
     ''
     """
@@ -207,8 +216,9 @@ def describe_drift(rig: str, kind: str, age_days: int) -> str:
     if not ages:
         return ""
     days, sigmas, percent = next((row for row in ages if row[0] >= age_days), ages[-1])
-    spread = f", {sigmas:g} standard errors" if sigmas else ""
-    return f"{percent:g} %{spread} at {days} days"
+    if sigmas < DRIFT_SIGMAS:
+        return "none beyond noise"
+    return f"{percent:g} %, {sigmas:g} standard errors, in {format_count(days, 'day')}"
 
 
 def count_days_left(found: Calibration, day: date) -> int:

@@ -229,9 +229,9 @@ def _measured_chromophores(source: SceneSource) -> tuple[SkinMap, SkinMap] | Non
 def _placed_chromophores(source: SceneSource, simulated: FaceColor) -> FaceColor:
     """Return the flash rig's chromophores on the texture, with the simulated rig for its blood."""
     placed, subject = place_chromophores(source, simulated), source.subject
-    rig = _simulate_rig(subject).transfer_to(
-        downsample(placed.hemoglobin, subject.size), valid=subject.atlas.covered
-    )
+    hemoglobin = downsample(placed.hemoglobin, subject.size)
+    covered = downsample(subject.atlas.covered.astype(np.float64), len(hemoglobin)) > 0.5
+    rig = _simulate_rig(subject).transfer_to(hemoglobin, valid=covered)
     return replace(placed, states=_stored_states(rig))
 
 

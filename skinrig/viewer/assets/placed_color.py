@@ -121,14 +121,19 @@ def place_chromophores(source: SceneSource, simulated: FaceColor) -> FaceColor:
     name = source.appearances["flash"].parameters.get("truth")
     where, atlas = _place(source, "flash", name, maps[MELANIN_MAP].values.shape)
     melanin, known = where.sample(maps[MELANIN_MAP].values, maps[MELANIN_MAP].mask)
+    if not known.any():
+        raise SceneError(
+            f"{source.paths['flash']}: no texel of the face has a valid melanin; expected landmarks "
+            "of this image, and skin in it; check both"
+        )
     left_out = _describe_unseen(atlas, known)
-    hemoglobin, left = simulated.hemoglobin, "color does not determine it; it is simulated"
-    if maps[HEMOGLOBIN_MAP].mask.any():
-        blood, seen = where.sample(maps[HEMOGLOBIN_MAP].values, maps[HEMOGLOBIN_MAP].mask)
+    blood, seen = where.sample(maps[HEMOGLOBIN_MAP].values, maps[HEMOGLOBIN_MAP].mask)
+    if seen.any():
         hemoglobin = fill_holes(blood, seen)
         left_out["blood of expressions"] = "captured at rest; expressions scale it as simulated"
     else:
-        left_out["blood of this face"] = left
+        hemoglobin = simulated.hemoglobin
+        left_out["blood of this face"] = "color does not determine it; it is simulated"
     return replace(
         simulated,
         melanin=fill_holes(melanin, known),

@@ -296,11 +296,10 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     """
     mean_mm, origin = skin_reflectance.population_mean_mm()
     probe = source.appearances.get("probe")
-    measured = [*source.fitted[:1], *([] if probe is None else [probe])]
-    if not measured:
+    if not source.fitted and probe is None:
         return gaussian_profiles.fit_gaussians(_typical_r_d(), 1.0 / mean_mm), None, origin
-    r_d = _mean_albedo(measured[0])
-    appearance = next((one for one in measured if TRANSLUCENCY_MAP in one.maps), measured[0])
+    r_d = _mean_albedo(source.fitted[0]) if source.fitted else _typical_r_d()
+    appearance = source.fitted[0] if probe is None else probe
     depth = appearance.maps.get(TRANSLUCENCY_MAP)
     if depth is None or not (known := depth.mask & (depth.values > 0).all(-1)).any():
         return gaussian_profiles.fit_gaussians(r_d, 1.0 / mean_mm), None, origin

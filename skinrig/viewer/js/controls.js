@@ -158,7 +158,7 @@ V.reset = () => {
   V.playing = false;
   const back = JSON.parse(JSON.stringify(V.initial));
   for (const name of ["weights", "traits"]) {
-    for (const key of Object.keys(V.params[name])) back[name][key] ??= 0;
+    for (const key of Object.keys(V.params[name] ?? {})) back[name][key] ??= 0;
   }
   for (const name of Object.keys(back)) if (V.transient(name)) delete back[name];
   V.set(back);

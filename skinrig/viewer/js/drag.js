@@ -27,6 +27,8 @@ V.orbit = (right, up) => V.set({
   camera_yaw_deg: V.turned(V.params.camera_yaw_deg - right),
   camera_pitch_deg: V.limit(V.params.camera_pitch_deg + up, -80, 80),
 });
+// By arrow keys: the camera goes where the arrow points.
+V.turn = (right, up) => V.orbit(-right, up);
 V.moveLight = (right, up) => V.set({
   light_azimuth_deg: V.turned(V.params.light_azimuth_deg + right),
   light_elevation_deg: V.limit(V.params.light_elevation_deg + up, -89, 89),
@@ -156,7 +158,7 @@ V.buildHands = () => {
       const step = event.shiftKey ? 15 : 5;
       if (V.tool === "probe") V.moveProbe(x * (event.shiftKey ? 10 : 1), -y * (event.shiftKey ? 10 : 1));
       else if (V.tool === "light") V.moveLight(step * x, step * y);
-      else V.orbit(-step * x, step * y);
+      else V.turn(step * x, step * y);
       if (V.tool !== "probe") V.speakPlace();
     } else if (key === "+" || key === "=") V.zoom(1 / 1.1);
     else if (key === "-") V.zoom(1.1);

@@ -6,6 +6,7 @@ Object.assign(V.defaults, {
 V.screen = () => [V.canvas.width, V.canvas.height];
 V.picture = () => V.scene.facts.picture;
 V.NEAREST_ZOOM = 64;
+V.SHARED.push("picture_x", "picture_y", "picture_zoom", "picture_aspect");
 
 // One picture, whose passes no other head draws.
 V.uploadMesh = V.buildScattering = V.drawCrowd = () => {};
@@ -36,6 +37,7 @@ V.movePicture = (right, up) => V.set({
   picture_x: V.limit(V.params.picture_x - right, 0, 1), picture_y: V.limit(V.params.picture_y - up, 0, 1),
 });
 V.orbit = (right, down) => V.movePicture(right / 200 / V.params.picture_zoom, -down / 200 / V.params.picture_zoom);
+V.turn = (right, up) => V.orbit(right, -up);
 V.pan = (right, up) => V.movePicture(right / V.params.picture_zoom, up / V.params.picture_zoom);
 V.zoom = factor => V.set({picture_zoom: V.limit(V.params.picture_zoom / factor, 1, V.NEAREST_ZOOM)});
 V.speakPlace = () => V.announce(V.tool === "light"

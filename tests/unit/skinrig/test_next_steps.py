@@ -100,6 +100,7 @@ def test_session_with_maps_is_viewed_next():
         ({"maps": ("melanin", "hemoglobin"), "truth": "truth-a"}, True),
         ({"maps": ("normals_n0", "height_n0")}, True),
         ({"maps": ("translucency",)}, True),
+        ({"maps": ("normals", "position"), "files": ("mesh.obj",)}, False),
     ],
 )
 def test_maps_are_viewed_where_view_takes_them(other, shown):

@@ -133,14 +133,15 @@ def test_tone_is_exact_for_any_thickness(seed):
     assert typology_angle_deg(melanin_of_tone("ita:27"), tissue) != pytest.approx(27.0, abs=0.02)
 
 
-@pytest.mark.parametrize("property_", NUISANCE_PARAMETERS[1:], ids=lambda one: one.name)
+@pytest.mark.parametrize("property_", NUISANCE_PARAMETERS, ids=lambda one: one.name)
 def test_published_people_fill_published_ranges(property_):
     name = {"baseline_factor": "baseline_amplitude"}.get(property_.name, property_.name)
     skins = [SubjectFile(tissue_model=model) for model in ("published", "drawn")]
     values = np.array([[getattr(s.properties(seed=k), name) for k in range(400)] for s in skins])
     wide, usual = (np.log(values) if property_.is_log else values).std(axis=1)
     # draws end at two deviations, and fractions at 1, 1.1 deviations above the usual eumelanin
-    assert 0.84 * property_.sd < wide < 1.02 * property_.sd
+    least = 0.75 if name == "epidermis_mm" else 0.84  # intervals reach to 0.15 mm, people 0.12 mm
+    assert least * property_.sd < wide < 1.02 * property_.sd
     assert usual < 0.45 * property_.sd
 
 

@@ -17,7 +17,7 @@ def normals(turn, valid=None):
     """Return normals that lean to the right by an angle in radians, with errors of a degree."""
     values = np.zeros((*SHAPE, 3), np.float32)
     values[...] = np.sin(turn), 0.0, np.cos(turn)
-    stderr = np.full_like(values, np.radians(1.0) / np.sqrt(3.0))
+    stderr = np.full_like(values, np.radians(1.0) / np.sqrt(2.0))
     return SkinMap(values, "1", stderr, valid)
 
 
@@ -36,7 +36,7 @@ def test_states_keep_their_order_size_and_errors(tmp_path):
     folder = write(tmp_path / "a", maps, states=["b", "a"], alpha={"value": 0.4})
     scene = faces.build_scene([folder], size=80)
     facts = scene.facts["picture"]
-    assert (scene.page, facts["states"], facts["pixels"]) == ("picture", ["b", "a"], [40, 24])
+    assert (scene.page, facts["states"]) == ("picture", ["b", "a"])
     texels = scene.textures["picture_normals"].values
     assert texels.shape == (2, *SHAPE, 3)
     np.testing.assert_allclose(texels[..., 0].mean(axis=(1, 2)), np.sin([0.3, -0.2]), atol=1e-6)
@@ -48,27 +48,34 @@ def test_states_keep_their_order_size_and_errors(tmp_path):
     assert packing.pack(scene).header["page"] == "picture"
 
 
-def test_large_picture_is_averaged_over_valid_pixels(tmp_path):
+def test_averages_and_scale_ignore_values_under_mask(tmp_path):
+    """Both at full size and reduced; the brightest color is 1."""
     values = np.full((*SHAPE, 3), 0.2, np.float32)
     valid = np.ones(SHAPE, bool)
-    values[::2], valid[::2] = 9.0, False
-    maps = {"normals": normals(0.1), "albedo": SkinMap(values, "1", valid=valid)}
-    scene = faces.build_scene([write(tmp_path / "a", maps)], size=64)
-    assert scene.textures["picture_color"].values.shape == (1, *SHAPE, 3)
-    maps = {name: SkinMap(np.tile(m.values, (4, 4, 1)), m.unit) for name, m in maps.items()}
-    scene = faces.build_scene([write(tmp_path / "b", maps)], size=80)
-    assert scene.textures["picture_normals"].values.shape == (1, 48, 80, 3)
-    scene = faces.build_scene([write(tmp_path / "c", {"normals": normals(0.1)})])
-    assert scene.facts["picture"]["states"] == [""]
+    values[::2, ::2], valid[::2, ::2] = 9.0, False
+    values, valid = np.tile(values, (4, 4, 1)), np.tile(valid, (4, 4))
+    flat = normals(0.1)
+    lean = SkinMap(np.tile(flat.values, (4, 4, 1)), "1")
+    maps = {"normals": lean, "albedo": SkinMap(values, "1", valid=valid)}
+    folder = write(tmp_path / "a", maps)
+    for size, shape in ((None, (96, 160)), (80, (48, 80))):
+        scene = faces.build_scene([folder], size=size)
+        color = scene.textures["picture_color"].values
+        assert color.shape == (1, *shape, 3)
+        np.testing.assert_allclose(color, 1.0, rtol=1e-6)
+        slopes = scene.textures["picture_normals"].values[0]
+        np.testing.assert_allclose(slopes[..., 0], np.sin(0.1), rtol=1e-5)
 
 
-def test_values_under_mask_never_reach_the_picture(tmp_path):
-    values = np.full((*SHAPE, 3), 0.2, np.float32)
-    valid = np.ones(SHAPE, bool)
-    values[::2], valid[::2] = 9.0, False
-    maps = {"normals": normals(0.1), "albedo": SkinMap(values, "1", valid=valid)}
-    scene = faces.build_scene([write(tmp_path / "a", maps)])
-    np.testing.assert_allclose(scene.facts["picture"]["color_white"], 0.2, rtol=1e-6)
+def test_error_of_components_is_that_of_the_angle(tmp_path):
+    """Image stacks state an error per component, the gradient rig per tangential axis."""
+    lean = normals(0.5)
+    axes = np.sqrt(1.0 - np.square(lean.values)) * np.radians(1.0) / np.sqrt(2.0)
+    scene = faces.build_scene(
+        [write(tmp_path / "a", {"normals": SkinMap(lean.values, "1", axes.astype(np.float32))})]
+    )
+    found = scene.facts["picture"]["layers"]["normal_stderr_deg"]
+    np.testing.assert_allclose(found, 1.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -86,3 +93,9 @@ def test_values_under_mask_never_reach_the_picture(tmp_path):
 def test_unusable_picture_is_refused_with_reason(tmp_path, maps, options, match):
     with pytest.raises(SceneError, match=match):
         faces.build_scene([write(tmp_path / "a", maps)], **options)
+
+
+def test_normals_on_a_mesh_are_no_picture(tmp_path):
+    maps = {"normals": normals(0.1), "position": SkinMap(np.zeros((*SHAPE, 3), np.float32), "mm")}
+    with pytest.raises(SceneError, match="normals of an image"):
+        faces.build_scene([write(tmp_path / "a", maps)])
