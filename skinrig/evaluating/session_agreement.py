@@ -10,9 +10,9 @@ sites of a fiber probe. Their errors have three parts:
 The last two are fractions of the stated standard uncertainties, measured between simulated sessions
 (`skinrig/data/session_errors.csv`, `skinrig bench --stage repeatability`). Those of optical maps
 are smaller than 1: the unknown optics of a person's skin are the same in both sessions, if the
-camera and the light are. Otherwise both fractions are at least 1. Each map has two tests: one of its mean over the whole
-skin, and a chi-squared test of all regions. A Sidak correction over tests and maps gives the
-verdict at a stated false-alarm rate.
+camera and the light are. Otherwise both fractions are at least 1. Each map has two tests: one of
+its mean over the whole skin, and a chi-squared test of all regions. A Sidak correction over tests
+and maps gives the verdict at a stated false-alarm rate.
 """
 
 import csv

@@ -123,8 +123,8 @@ def place_chromophores(source: SceneSource, simulated: FaceColor) -> FaceColor:
     melanin, known = where.sample(maps[MELANIN_MAP].values, maps[MELANIN_MAP].mask)
     if not known.any():
         raise SceneError(
-            f"{source.paths['flash']}: no texel of the face has a valid melanin; expected landmarks "
-            "of this image, and skin in it; check both"
+            f"{source.paths['flash']}: no texel of the face has a valid melanin; "
+            "expected landmarks of this image, and skin in it; check both"
         )
     left_out = _describe_unseen(atlas, known)
     blood, seen = where.sample(maps[HEMOGLOBIN_MAP].values, maps[HEMOGLOBIN_MAP].mask)
