@@ -140,6 +140,32 @@ def test_chromophores_of_flash_maps_reach_their_place(subject, folder):
     assert "blood of expressions" in dict(found.left_out)
 
 
+@pytest.mark.parametrize("blood", [True, False])
+def test_small_flash_maps_without_blood_are_shown(subject, folder, blood):
+    """Fewer texels than the person has; dark skin has no valid blood."""
+    moving, _ = dynamic_appearance.read(folder / "appearance")
+    maps = {}
+    for name in ("melanin", "hemoglobin"):
+        few = moving.maps[name].values[::8, ::8]
+        valid = moving.maps[name].mask[::8, ::8] & (blood or name == "melanin")
+        maps[name] = SkinMap(few, moving.maps[name].unit, valid=valid)
+    flash = SkinAppearance(maps, "simulated", {"kind": "appearance"}, {}, seed=3)
+    marks = [line.split(",") for line in (folder / "landmarks.csv").read_text().splitlines()[1:]]
+    lines = [f"{n},{(float(x) - 3.5) / 8},{(float(y) - 3.5) / 8}" for n, x, y in marks]
+    (folder / "small.csv").write_text("\n".join(["name,x,y", *lines]) + "\n")
+    kept = {"appearances": {"flash": flash}, "paths": {"flash": folder / "flash"}}
+    skin = FineSkin(subject, SIZE)
+    of = "flash", procedural.build_viewer_mesh(subject), SIZE, 0, subject, skin
+    found = facial_color_assets._face(
+        SceneSource(*of, **kept, landmarks=folder / "small.csv"), measured=False
+    )
+    assert found.melanin.shape == (64, 64)
+    assert found.melanin.min() > 0.0
+    left_out = dict(found.left_out)
+    assert ("blood of this face" in left_out) is not blood
+    assert found.hemoglobin.min() > 0.0
+
+
 def test_two_colors_of_one_face_are_refused(folder):
     moving, _ = dynamic_appearance.read(folder / "appearance")
     maps = {name: moving.maps[name] for name in ("melanin", "hemoglobin")}
