@@ -14,39 +14,24 @@ from skinrig.benchmarks.stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, to_json_value
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
-# simulated sessions, surveys and faces: over 5 s of processor time even when small
-HEAVY = {
-    "brdf-people",
-    "dome-geometry",
-    "editing",
-    "end-to-end",
-    "gradient-normals",
-    "head-motion",
-    "independent-skin",
-    "intervals",
-    "normal-integration",
-    "omissions",
-    "one-person",
-    "oxygenation",
-    "probe-session",
-    "reference-dome",
-    "reference-gradient",
-    "reference-probe",
-    "reference-relief",
-    "reference-world",
-    "render-dome",
-    "render-flash",
-    "render-gradient",
-    "render-model",
-    "repeatability",
-    "scan-decoding",
-    "skin-gamut",
-    "sphere-lights",
-    "template",
-    "traits",
-    "translucency-people",
-    "transport",
-    "unmodeled-light",
+# less than a second of processor time at toy size
+QUICK = {
+    "anisotropy",
+    "color-table",
+    "diffuse-albedo",
+    "facial-color",
+    "hdr",
+    "layered-reflectance",
+    "light-order",
+    "lumitexels",
+    "microstructure",
+    "microstructure-passes",
+    "normals",
+    "subsurface-batch",
+    "texture-fill",
+    "translucency",
+    "wrinkle-storage",
+    "wrinkle-weights",
 }
 MIN_POINTS = 4
 
@@ -144,7 +129,7 @@ RESULTS = {
 
 
 @pytest.mark.parametrize(
-    "stage", [pytest.param(s, marks=pytest.mark.long if s in HEAVY else ()) for s in STAGES]
+    "stage", [pytest.param(s, marks=() if s in QUICK else pytest.mark.long) for s in STAGES]
 )
 def test_stage_result_satisfies_schema(stage, tmp_path, capsys, monkeypatch):
     made, to_benchmark = [], BenchmarkStage.to_benchmark

@@ -106,6 +106,7 @@ def serious(page, axe):
     )
 
 
+@pytest.mark.long
 def test_report_makes_no_requests_and_policy_blocks_nothing(browser, pages):
     for path in pages:
         context, page, problems = opened(browser, path)
@@ -119,6 +120,7 @@ def test_report_makes_no_requests_and_policy_blocks_nothing(browser, pages):
         context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", WIDTHS)
 def test_first_screen_shows_images_below_the_verdict(browser, pages, width):
     for path in pages:
@@ -136,6 +138,7 @@ def test_first_screen_shows_images_below_the_verdict(browser, pages, width):
         context.close()
 
 
+@pytest.mark.long
 def test_enlarged_image_reads_values_of_map(browser, pages):
     """Rationale: values come from colors alone; the map rises from 0.02 to 0.12 row by row.
 
@@ -179,6 +182,7 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
     context.close()
 
 
+@pytest.mark.long
 def test_linked_image_is_compared_with_its_partner(browser, tmp_path):
     """A repeated image is a link; its group still compares two images."""
     rng, shown = np.random.default_rng(12345), []
@@ -202,6 +206,7 @@ def test_linked_image_is_compared_with_its_partner(browser, tmp_path):
     context.close()
 
 
+@pytest.mark.long
 def test_policy_refuses_foreign_content(browser, pages, tmp_path):
     path = tmp_path / "changed.html"
     text = pages[0].read_text(encoding="utf-8")
@@ -212,6 +217,7 @@ def test_policy_refuses_foreign_content(browser, pages, tmp_path):
     context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", WIDTHS)
 def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
@@ -223,6 +229,7 @@ def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
         context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1250)])
 def test_axe_accepts_enlarged_image_and_status(browser, pages, axe, tmp_path, scheme, width):
     context, page, _ = opened(browser, pages[0], scheme=scheme, width=width, bypass_csp=True)
@@ -247,6 +254,7 @@ def test_axe_accepts_enlarged_image_and_status(browser, pages, axe, tmp_path, sc
     context.close()
 
 
+@pytest.mark.long
 def test_axe_finds_image_without_text_and_low_contrast(browser, pages, axe, tmp_path):
     path = tmp_path / "changed.html"
     text = pages[0].read_text(encoding="utf-8").replace(' alt="', ' data-alt="', 1)
@@ -259,6 +267,7 @@ def test_axe_finds_image_without_text_and_low_contrast(browser, pages, axe, tmp_
     context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", WIDTHS)
 def test_only_tables_scroll_sideways_and_keyboard_reaches_them(browser, pages, width):
     context, page, _ = opened(browser, pages[0], width=width)
@@ -274,6 +283,7 @@ def test_only_tables_scroll_sideways_and_keyboard_reaches_them(browser, pages, w
     context.close()
 
 
+@pytest.mark.long
 def test_plot_text_has_page_text_color(browser, pages):
     for scheme in ("light", "dark"):
         context, page, _ = opened(browser, pages[0], scheme=scheme)
@@ -285,6 +295,7 @@ def test_plot_text_has_page_text_color(browser, pages):
         context.close()
 
 
+@pytest.mark.long
 def test_printed_pages_are_white_and_show_folded_content(browser, pages):
     context, page, _ = opened(browser, pages[0], scheme="dark")
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -300,6 +311,7 @@ def test_printed_pages_are_white_and_show_folded_content(browser, pages):
     context.close()
 
 
+@pytest.mark.long
 def test_skip_link_and_contents_lead_to_targets(browser, pages):
     context, page, _ = opened(browser, pages[0])
     page.keyboard.press("Tab")

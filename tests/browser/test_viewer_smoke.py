@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 
+@pytest.mark.long
 def test_page_draws_face_without_errors_or_requests(viewer):
     picture = viewer.read("display")
     assert picture.shape == (256, 256, 4)
@@ -14,6 +16,7 @@ def test_page_draws_face_without_errors_or_requests(viewer):
     assert viewer.problems == []
 
 
+@pytest.mark.long
 def test_first_image_equals_redrawn_image(open_page, procedural_html):
     """Textures reach the device while the first frame is drawn, and keep their own places.
 

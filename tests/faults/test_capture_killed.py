@@ -26,6 +26,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
 def test_capture_killed_awaiting_frame_resumes_at_once(tmp_path, transport, capsys):
     """The kill falls into a read-out of 1 s; served devices notice that their client is gone."""

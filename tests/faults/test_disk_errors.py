@@ -68,6 +68,7 @@ def finish(path, acknowledged):
     assert verify(path).ok
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", DISK_FAULTS)
 def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
     struck = Counter()

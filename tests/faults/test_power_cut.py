@@ -173,6 +173,7 @@ def test_power_cut_at_any_instant_keeps_acknowledged_data(tmp_path, frames):
     assert counts["ok"] > 15 * frames
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mutant", "crime"),
     [

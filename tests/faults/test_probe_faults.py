@@ -124,6 +124,7 @@ class Host:
         raise error
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "faults", "expected"), ON_THE_LINE)
 def test_probe_lights_once_per_accepted_opening_reports_end(number, faults, expected):
     world = World(RIG, seed=number, faults=Faults(**faults))

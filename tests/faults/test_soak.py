@@ -25,6 +25,7 @@ def box_side():
     """Leave the boxes emulated: bugs are planted into the emulation."""
 
 
+@pytest.mark.long
 def test_soak_of_same_seed_repeats_every_byte():
     first, second, other = (run_soak(seed, hours=24, shots_per_day=30) for seed in (5, 5, 6))
     assert first.failure == second.failure == other.failure == ""

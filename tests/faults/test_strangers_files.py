@@ -160,6 +160,7 @@ def peak_bytes(act):
         tracemalloc.stop()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_attack_is_refused_within_memory(tmp_path, attack):
     name, forge = ATTACKS[attack]

@@ -48,6 +48,7 @@ def world():
         one.unregister()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "faults", "error"), ON_THE_LINE)
 def test_nothing_is_done_twice_or_wrongly_acknowledged(world, ledger, number, faults, error):
     simulated, url = world(seed=number, **faults)

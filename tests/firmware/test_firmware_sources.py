@@ -61,6 +61,7 @@ def test_firmware_uses_neither_heap_nor_stdio():
             assert not any(word in text for word in ("malloc", "stdio.h", "printf(", "stdlib.h"))
 
 
+@pytest.mark.long
 @needs_cc
 @each_box
 def test_firmware_answers_as_emulated_box_byte_for_byte(name):

@@ -158,6 +158,7 @@ def unjudged(public, known):
     return sorted(silent)
 
 
+@pytest.mark.long
 def test_public_functions_are_driven_over_domain_or_exempt():
     assert unjudged(public_functions(), driven() | named_by_tests()) == []
 

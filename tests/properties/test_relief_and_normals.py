@@ -200,6 +200,7 @@ def test_parts_are_connected_and_cover_valid_area(seed, sides):
     assert not height[~valid].any()
 
 
+@pytest.mark.long
 @FEW
 @given(
     tilt=st.tuples(*[st.floats(-2.0, 2.0)] * 2),
@@ -262,6 +263,7 @@ def test_a_high_pass_takes_planes_away_and_scales(seed, scale, cutoff):
     assert not first[~valid].any()
 
 
+@pytest.mark.long
 @FEW
 @given(seed=SEED, strength=st.floats(0.0, 4.0))
 def test_smoothed_slopes_are_numbers_within_those_given(seed, strength):
@@ -529,6 +531,7 @@ def test_table_through_collinear_points_is_the_line(seed, slope):
     assert kernel_table.alpha_rms(table.table, stretch, alpha) < 0.02
 
 
+@pytest.mark.long
 @FEW
 @given(seed=SEED, scale=st.sampled_from([1e-10, 1.0, 1e10]))
 def test_highlight_half_vectors_give_normal_at_any_exposure(seed, scale):

@@ -402,6 +402,7 @@ def test_masks_are_equal_as_planes_and_textures(seed, zones, dtype):
     assert not again[zones:].any()
 
 
+@pytest.mark.long
 @CHEAP
 @given(seed=SEED, strength=st.floats(0.0, 1.0))
 def test_normal_difference_at_full_strength_is_other_map(seed, strength):

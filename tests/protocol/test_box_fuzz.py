@@ -69,6 +69,7 @@ def test_nearly_valid_unframed_lines_light_and_move_nothing(manual, rng):
     assert manual.idle(bench.unit)
 
 
+@pytest.mark.long
 @each_box
 def test_framed_nonsense_is_answered_once_acts_only_armed(manual, rng):
     """Half of the lines are good ones and obeyed: a box that refuses all would not pass."""

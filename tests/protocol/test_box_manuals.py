@@ -93,6 +93,7 @@ def test_safety_commands_need_neither_frame_nor_arming(manual, text):
     assert manual.idle(bench.unit)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("manual", "text"),
     [

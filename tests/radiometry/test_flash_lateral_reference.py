@@ -18,6 +18,7 @@ from rigsim.tissue.skin_table import SkinTable
 FALSE_ALARM = 1e-4  # per test
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("wavelength_nm", "c_m", "c_hd"), [(560.0, 0.02, 0.02), (630.0, 0.01, 0.04), (450.0, 0.1, 0.05)]
 )

@@ -148,6 +148,7 @@ def light_and_camera(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
     return directions_around_the_normal(count, rng), directions_around_the_normal(count, rng)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 @pytest.mark.parametrize("alpha", [0.1, 0.3])
 def test_skin_of_one_lobe_is_polarized_plastic(mitsuba, alpha, mode):

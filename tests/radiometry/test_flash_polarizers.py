@@ -37,6 +37,7 @@ def block_deviation(image: np.ndarray, seeds: np.ndarray) -> float:
     return float(np.abs(t).max() / stats.t.isf(per_block / 2, len(seeds) - 1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["parallel", "crossed"])
 def test_image_blocks_match_path_tracer_within_noise(name):
     """Rationale: filters, Fresnel, GGX, both lights, geometry and units at once.

@@ -57,6 +57,7 @@ def traced(skin, pixels, **settings):
     return scene_pixels(scene, pixels)
 
 
+@pytest.mark.long
 def test_mitsuba_moments_match_shadow_rays(skin, pixels, reference):
     """Tolerance: 0.3 % of the mean, by 4 instead of 16 samples per pixel; the mean within 0.1 %."""
     found = traced(skin, pixels)
@@ -76,6 +77,7 @@ def test_mitsuba_error_falls_with_samples(skin, pixels, reference):
     assert errors[2] < 2e-4
 
 
+@pytest.mark.long
 def test_fast_renderer_agrees_with_mitsuba(skin, pixels):
     """Bounds: horizons in 32 directions and the table err by less than 0.5 % of the mean."""
     fast = scene_pixels(plain_scene(skin, width_px=WIDTH), pixels)
@@ -84,12 +86,14 @@ def test_fast_renderer_agrees_with_mitsuba(skin, pixels):
     assert abs(way.mean_ratio - 1.0) < 0.002
 
 
+@pytest.mark.long
 def test_unshadowed_relief_breaks_both_bounds(skin, pixels, reference):
     way = compare_with_reference(traced(skin, pixels, shadows=False), reference, 0.0)
     assert way.error > 0.01
     assert way.mean_ratio - 1.0 > 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("extinction", [np.inf, 300.0, 3.0])
 def test_all_stokes_channels_match_exact_sums(skin, choice, extinction):
     """Expected: the sums of `lobe_moments` at each sample. Tolerance: 1e-3 of the mean light
@@ -112,6 +116,7 @@ def test_all_stokes_channels_match_exact_sums(skin, choice, extinction):
     assert np.abs(expected[[1, 2]]).max() > 0.1 * expected[0].mean()  # polarized indeed
 
 
+@pytest.mark.long
 def test_scene_of_relief_renders_by_path(skin, choice):
     """The same scene by Mitsuba's own path tracer, under polarizers that transmit everything.
     Tolerance: 4 standard errors of its mean over blocks of pixels."""
@@ -133,6 +138,7 @@ def test_scene_of_relief_renders_by_path(skin, choice):
     assert abs(way.mean_ratio - 1.0) < 4.0 * way.mean_ratio_stderr
 
 
+@pytest.mark.long
 def test_subpixels_are_means_of_a_finer_image(skin, choice):
     """`mi.render` of 2 x 2 rays per pixel; tolerance: rounding, and rays at edges of triangles."""
     mi = load_mitsuba(choice)
@@ -161,6 +167,7 @@ def test_subpixels_are_means_of_a_finer_image(skin, choice):
     assert np.ptp(mean[..., 0]) > 0.1 * mean[..., 0].mean()
 
 
+@pytest.mark.long
 def test_wrong_scenes_of_ledmoments_are_refused(choice):
     mi = load_mitsuba(choice)
     integrator = load_description(mi, {"type": "ledmoments", "table": np.ones((1, 4))})
@@ -183,6 +190,7 @@ def test_wrong_scenes_of_ledmoments_are_refused(choice):
         load_description(mi, {"type": "ledmoments", "table": np.ones((2, 5))})
 
 
+@pytest.mark.long
 def test_coated_skin_agrees_with_olat(choice):
     """Rationale: `olat` has the unpolarized formulas of hair, coating and diffuse term. Expected:
     S0 and the entering light, led out, add up to its image. Tolerance: rounding of float32."""

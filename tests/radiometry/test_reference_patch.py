@@ -40,6 +40,7 @@ def darkest_quarter(image):
     return np.unravel_index(quarters.argmin(), quarters.shape)
 
 
+@pytest.mark.long
 def test_dark_quarter_is_upper_right_everywhere(patch, renders):
     """Rationale: row 0 is at the top, and x points to the right, as in the flash rig's images."""
     melanin, _ = pixel_truth(patch, 4)
@@ -49,11 +50,13 @@ def test_dark_quarter_is_upper_right_everywhere(patch, renders):
     assert darkest_quarter(fast) == (0, 1)
 
 
+@pytest.mark.long
 def test_width_that_splits_voxels_is_refused(patch):
     with pytest.raises(ValueError, match="a divisor of"):
         pixel_truth(patch, 5)
 
 
+@pytest.mark.long
 def test_noise_of_patch_falls_with_samples(renders):
     """Tolerance: factor 4 of the expected ratio of 16; channels share bands, so that the variance
     of 16 pixels errs by a third, and the ratio's logarithm by .5.

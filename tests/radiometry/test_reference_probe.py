@@ -71,6 +71,7 @@ def test_walk_agrees_with_simulators_photons(run):
     assert misfit(mean, stderr, simulated(darker, photons=40_000, seed=2)) > bound
 
 
+@pytest.mark.long
 def test_laid_paths_take_added_absorption(run):
     """Rationale: even absorption lowers readings as two separate walks state it, at any place."""
     darker = trace_placed_paths(

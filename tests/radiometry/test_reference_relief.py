@@ -37,6 +37,7 @@ def images():
     return patch, rig, slopes, light
 
 
+@pytest.mark.long
 def test_fast_image_has_heights_of_voxels(images):
     """Rationale: skin that rises toward +x turns away from light at +x. Rows swapped fail."""
     _, _, slopes, light = images
@@ -45,6 +46,7 @@ def test_fast_image_has_heights_of_voxels(images):
         assert np.corrcoef(-slope[::-1].ravel(), image.ravel())[0, 1] < 0.4
 
 
+@pytest.mark.long
 def test_lateral_scattering_lowers_contrast(images):
     *_, light = images
     local, scattered = (light[lateral][1] / light[lateral][0].mean() for lateral in (False, True))
@@ -53,6 +55,7 @@ def test_lateral_scattering_lowers_contrast(images):
     assert compare_contrast(np.stack([local, local]), local).slope == pytest.approx(1.0)
 
 
+@pytest.mark.long
 def test_diffuse_normals_state_error_of_grooves(images):
     """Bound: half to twice the stated error; light that stays where it entered exceeds it."""
     patch, rig, _, light = images

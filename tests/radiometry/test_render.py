@@ -144,6 +144,7 @@ def test_both_ray_tracers_agree(view):
     assert np.abs(one.position_mm - other.position_mm)[both].max() < 5e-3
 
 
+@pytest.mark.long
 def test_rays_never_slip_between_closed_surface_triangles(choice, view):
     fine = render.g_buffer(
         render.Caster(sphere(60.0, columns=720, rows=360), choice=choice), view, subpixels=4

@@ -96,6 +96,7 @@ def test_half_space_without_mismatch_misses_giovanelli():
     assert not agrees(run.specular + run.reflectance, run.reflectance_stderr, 0.2600)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("albedo", "published"), [(0.5, 0.11523), (0.9, 0.41495), (0.99, 0.75272)])
 def test_matched_half_space_matches_the_exact_h_function(albedo, published):
     """Rationale: long walks, roulette. Expected: Chandrasekhar's H function, solved here."""
@@ -107,6 +108,7 @@ def test_matched_half_space_matches_the_exact_h_function(albedo, published):
     assert not agrees(darker.reflectance, darker.reflectance_stderr, exact)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("albedo", "total"), [(0.5, 0.08009), (0.9, 0.27840), (0.99, 0.63139)])
 def test_half_space_of_skins_index_matches_adding_doubling(albedo, total):
     """Rationale: the index of skin, 1.4. Expected: iadpython (UR1, specular included)."""
@@ -116,6 +118,7 @@ def test_half_space_of_skins_index_matches_adding_doubling(albedo, total):
     assert not agrees(darker.specular + darker.reflectance, darker.reflectance_stderr, total)
 
 
+@pytest.mark.long
 def test_three_layers_match_the_sample_output_of_mcml():
     """Rationale: several layers with unlike g. Expected: sample.mco of MCML, 1e6 photons
     (Wang, Jacques, Zheng 1995, doi:10.1016/0169-2607(95)01640-F); its own noise is allowed for."""
@@ -149,11 +152,13 @@ def radial_p_value(stack):
     return 1.0 - (1.0 - 2.0 * stats.t.sf(worst, BATCHES - 1)) ** len(mcml)
 
 
+@pytest.mark.long
 def test_radial_profile_matches_the_sample_output_of_mcml():
     """Expected: ten rings of sample.mco. False alarms: below 1e-3 for all rings together."""
     assert radial_p_value(MCML_SAMPLE) > 1e-3
 
 
+@pytest.mark.long
 def test_reduced_forward_scattering_misses_radial_profile():
     assert radial_p_value(with_layer(MCML_SAMPLE, 0, g=0.88)) < 1e-3
 

@@ -42,6 +42,7 @@ def reflects(stack, expected, samples, *, digits=5e-4, **more):
     return bool(abs(found.reflectance - expected) < 4.0 * found.stderr + digits)
 
 
+@pytest.mark.long
 def test_half_space_matches_giovanelli_uniquely():
     """Expected: Giovanelli 1955 (doi:10.1080/713821040), .2600 with the specular .04."""
     assert reflects(GIOVANELLI, 0.2200, 6144)
@@ -49,6 +50,7 @@ def test_half_space_matches_giovanelli_uniquely():
     assert not reflects(LayerStack((thin,)), 0.2200, 6144)
 
 
+@pytest.mark.long
 def test_matched_slab_matches_van_de_hulst_uniquely():
     """Expected: van de Hulst 1980, table 35, R .09739."""
     assert reflects(VAN_DE_HULST, 0.09739, 16384)
@@ -56,6 +58,7 @@ def test_matched_slab_matches_van_de_hulst_uniquely():
     assert not reflects(LayerStack((wide,)), 0.09739, 16384)
 
 
+@pytest.mark.long
 def test_white_furnace_returns_all_light():
     """Rationale: without absorption all light that enters leaves. Expected: 1 - F(0)."""
     whole = 1.0 - (0.4 / 2.4) ** 2
@@ -248,6 +251,7 @@ def test_layers_of_two_indices_are_refused():
         describe_flat_layers(stack)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scattering", [(1.0, 1.0, 1.0), (1.4, 1.0, 0.6)], ids=["shared", "own"])
 def test_bands_together_match_each_band_alone(scattering):
     """Rationale: bands share walks where scattering is even over them, and have their own else."""

@@ -96,6 +96,7 @@ def test_matched_half_space_lanes_match_exact_h_function(albedo):
     assert agrees(run.reflectance, run.reflectance_stderr, exact)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ENGINES)
 def test_half_space_of_fast_photons_matches_mcml(engine):
     """Expected: .3592 by MCML for g .9, sigma_s 10, sigma_a .05 per mm, n 1.4."""

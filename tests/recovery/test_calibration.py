@@ -409,6 +409,7 @@ def test_uncorrected_exit_polarization_fails_bound_met_when_corrected():
     assert (np.abs(wrong) > 0.03 * truth[steep & (np.abs(n[:, 1]) > 0.7), 0]).mean() > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.render
 @pytest.mark.parametrize("kind", ["sensor", "polarization", "color"])
 def test_targets_captured_by_full_rig_calibrate_to_truth(kind, tmp_path):

@@ -308,6 +308,7 @@ def registration_error(maps):
     return degrees, np.linalg.norm(shift), record
 
 
+@pytest.mark.long
 def test_ellipsoid_normals_match_its_equation(found):
     """No relief and no errors of calibration: what is left is noise, pixels and highlights."""
     result = found[1]
@@ -320,12 +321,14 @@ def test_ellipsoid_normals_match_its_equation(found):
     assert np.median(half.normals_deg) > 4 * np.median(result.normals_deg)
 
 
+@pytest.mark.long
 def test_albedo_is_absolute_and_excludes_highlight(found):
     result = found[1]
     assert np.abs(np.median(result.r_d, axis=0)).max() < 0.01
     assert np.median(np.abs(result.r_d), axis=0).max() < 0.02
 
 
+@pytest.mark.long
 def test_scan_is_registered_to_ellipsoid(found):
     """Turned about itself an ellipsoid looks nearly the same: its place is what is known well."""
     degrees, off_mm, record = registration_error(found[1].maps)
@@ -337,6 +340,7 @@ def test_scan_is_registered_to_ellipsoid(found):
     assert np.linalg.norm(away) > 3.0
 
 
+@pytest.mark.long
 def test_existing_results_are_not_recomputed(found):
     folder, first = found
     assert first.outcome.assumed == ()
@@ -353,6 +357,7 @@ def test_existing_results_are_not_recomputed(found):
     assert store.read(folder / "appearance").files.keys() == {"mesh.obj"}
 
 
+@pytest.mark.long
 def test_held_out_frames_are_not_read(found, monkeypatch):
     folder, first = found
     read = []
@@ -397,6 +402,7 @@ def _frames(folder):
     return {(record.index["light"], record.camera) for record in records}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hold_out", "named"),
     [
@@ -441,6 +447,7 @@ def test_requested_number_of_lobes_is_made(found):
         assert stored["error_by_rank"][-1] < 0.5 * stored["error_by_rank"][0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rank", "want", "named"),
     [(2, "basis_weight_2", "basis_weight_1"), (0, "normals", "rank: got 0")],
@@ -456,6 +463,7 @@ def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
         )
 
 
+@pytest.mark.long
 def test_missing_tracking_frames_record_untracked_head(found):
     assert found[1].maps.parameters["motion"] == {"tracking_frames": 0}
 

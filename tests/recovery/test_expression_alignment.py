@@ -58,6 +58,7 @@ def off(found, seen):
     return np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
 
 
+@pytest.mark.long
 def test_smile_motion_of_five_pixels_found_within_half(smiling, aligned):
     """Landmarks to 1 px leave more than that between them; not to align leaves all of it."""
     assert aligned.valid[smiling.valid].mean() > 0.93
@@ -69,6 +70,7 @@ def test_smile_motion_of_five_pixels_found_within_half(smiling, aligned):
     assert np.sqrt(np.mean(moved[smiling.valid] ** 2)) > 4.0
 
 
+@pytest.mark.long
 def test_stated_position_error_covers_the_true_error(smiling, aligned):
     """Within twice the root mean square: 98 % for a normal error, 90 % asked; a quarter fails."""
     error, stated = off(aligned, smiling), aligned.error_px[aligned.valid]
@@ -80,6 +82,7 @@ def test_stated_position_error_covers_the_true_error(smiling, aligned):
     assert np.mean(error[order[-third:]]) > 1.5 * np.mean(error[order[:third]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["exercise", "fear"])
 def test_varying_blood_is_not_read_as_motion(face, state):
     rng = np.random.default_rng(3)
@@ -103,6 +106,7 @@ def test_features_alone_find_the_motion_too(smiling):
     assert np.sqrt(np.mean(off(found, smiling) ** 2)) < 0.5
 
 
+@pytest.mark.long
 def test_state_blood_is_mapped_onto_neutral_face(smiling, aligned):
     """Warped blood against the state's blood at rest: interpolation leaves less than the change."""
     blood, seen = aligned.warp(smiling.hemoglobin_moving, smiling.valid_moving)
@@ -148,6 +152,7 @@ def test_joint_inversion_of_aligned_states_improves_changes(smiling, aligned):
     assert np.mean(error < 0.5 * stated) < 0.9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["smile", "exercise"])
 def test_blends_tolerate_misaligned_maps_but_interpolated_maps_fail(face, state):
     """Jimenez et al. 2010, section 4.2: good results even with imperfect alignment.

@@ -100,6 +100,7 @@ def test_white_balance_error_of_10_percent_breaks_bounds(tmp_path, calibration, 
     assert broken
 
 
+@pytest.mark.long
 def test_subject_is_reconstructed_only_as_far_as_requested(tmp_path, narrow):
     first = pipeline.reconstruct(narrow.session, want=["melanin"], out=tmp_path / "maps")
     assert first.ran == ("frames", "separation", "chromophores")
@@ -118,6 +119,7 @@ def test_subject_is_reconstructed_only_as_far_as_requested(tmp_path, narrow):
     assert (maps["melanin"].stderr[valid] > 0).all()
 
 
+@pytest.mark.long
 def test_wrong_noise_profile_is_harmless_with_calibrated_sensor(tmp_path, monkeypatch, narrow):
     simulate_session("flash", tmp_path / "session-flat", target="flat", seed=3, width_px=96)
     calibrate("sensor", [tmp_path / "session-flat"], tmp_path / "store", created=TODAY)
@@ -149,12 +151,14 @@ def test_wrong_noise_profile_is_harmless_with_calibrated_sensor(tmp_path, monkey
     np.testing.assert_array_equal(unmoved, measured)
 
 
+@pytest.mark.long
 def test_reconstruction_needs_no_truth(tmp_path, narrow):
     alone = shutil.copytree(narrow.session, tmp_path / "session-flash")
     outcome = pipeline.reconstruct(alone, want=["hemoglobin"], out=tmp_path / "maps")
     assert "chromophores" in outcome.ran
 
 
+@pytest.mark.long
 def test_calibration_of_other_day_is_refused_by_name(tmp_path, narrow):
     from capture.calibration.store import CalibrationError
 
@@ -172,6 +176,7 @@ def test_calibration_of_other_day_is_refused_by_name(tmp_path, narrow):
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.mark.long
 def test_an_interrupted_simulation_resumes_to_the_same_frames(tmp_path, narrow):
     seen = []
 

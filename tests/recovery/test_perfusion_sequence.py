@@ -167,6 +167,7 @@ def test_interrupted_simulation_keeps_truth_of_all_frames(tmp_path):
     assert session.is_dir()
 
 
+@pytest.mark.long
 @pytest.mark.render
 def test_non_sequence_gives_no_perfusion_curves(tmp_path):
     plain = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")

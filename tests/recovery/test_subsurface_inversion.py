@@ -49,6 +49,7 @@ def fit(profiles, variance, method="photon_table", **settings):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sigma_a", "sigma_s", "g"), [(0.04, 1.0, 0.8), (0.25, 1.5, 0.73), (1.0, 1.5, 0.8)]
 )
@@ -86,6 +87,7 @@ def test_media_outside_asymmetry_prior_are_not_valid(sigma_a, sigma_s, g, bias, 
     assert abs(np.median(informed.sigma_tr_per_mm) / expected - 1.0) < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("g", [0.7, 0.94])
 def test_media_at_ends_of_asymmetry_prior_are_valid(g, rng):
     """200 draws of two media; one false alarm is expected in 1000."""

@@ -150,6 +150,7 @@ BREAKS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
 def test_verify_finds_the_damage(session, damage, capsys):
     damage(session)
@@ -159,6 +160,7 @@ def test_verify_finds_the_damage(session, damage, capsys):
     assert "Traceback" not in out + err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
 def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tmp_path):
     damage(session)
@@ -170,6 +172,7 @@ def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tm
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -199,6 +202,7 @@ def test_impossible_option_is_refused_before_image_processing(words, says, sound
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_blood_undetermined_without_white_reference_error_names_remedy(
     sound, tmp_path, monkeypatch, capsys
 ):
@@ -228,6 +232,7 @@ def journal_keeps_two_lines(session):
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:2]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", [journal_is_empty, journal_keeps_two_lines])
 def test_session_whose_journal_lost_lines_is_incomplete(session, damage, capsys):
     frames = len(list((session / "frames").iterdir()))
@@ -241,6 +246,7 @@ def test_session_whose_journal_lost_lines_is_incomplete(session, damage, capsys)
     assert len(list((session / "frames").iterdir())) == frames
 
 
+@pytest.mark.long
 def test_a_sound_session_passes(session, capsys):
     assert main(["verify", str(session)]) == 0
 
@@ -264,6 +270,7 @@ def test_broken_rig_file_is_refused_with_all_faults(text, says, tmp_path, capsys
     assert "traceback" not in err
 
 
+@pytest.mark.long
 def test_calibration_folder_without_rig_calibrations_is_refused(session, tmp_path, capsys):
     order = ["reconstruct", str(session), "--maps", "melanin", "--out", str(tmp_path / "maps")]
     assert main([*order, "--calibration", str(session)]) == 3
@@ -276,6 +283,7 @@ def test_calibration_folder_without_rig_calibrations_is_refused(session, tmp_pat
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "order",
     [

@@ -374,6 +374,7 @@ def test_the_readme_names_commands_that_exist(command):
     assert command in COMMANDS
 
 
+@pytest.mark.long
 def test_simulated_world_is_captured_by_controller_camera_urls(tmp_path, monkeypatch):
     monkeypatch.setattr("rigsim.world.world._WORLDS", {})
     out = tmp_path / "session"

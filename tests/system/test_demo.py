@@ -84,6 +84,7 @@ def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.long
 def test_parallel_rig_threads_sleep_unless_user_sets_policy(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")

@@ -23,6 +23,7 @@ def portrait(tmp_path_factory):
     return json.loads(done.stdout), folder, arguments
 
 
+@pytest.mark.long
 def test_maps_hold_skin_alone(portrait):
     document, _, _ = portrait
     maps = store.read(document["appearance"]).maps
@@ -36,6 +37,7 @@ def test_maps_hold_skin_alone(portrait):
     assert maps["image"].mask[: height // 6].any()  # the image itself is whole
 
 
+@pytest.mark.long
 def test_report_is_one_page(portrait):
     document, folder, _ = portrait
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
@@ -43,6 +45,7 @@ def test_report_is_one_page(portrait):
     assert "Melanosome volume fraction" in page
 
 
+@pytest.mark.long
 def test_second_run_changes_nothing(portrait, capsys):
     _, folder, arguments = portrait
     before = (folder / "out" / "report.html").read_bytes()

@@ -51,6 +51,7 @@ def test_rename_table_names_existing_options_only(path):
         assert former not in names
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize(("path", "former", "present"), FORMER_NAMES)
 def test_former_name_is_parsed_as_present_one(path, former, present, joined, capsys, monkeypatch):
@@ -115,6 +116,7 @@ def completions(words):
     return run.stdout.split(), run.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -85,6 +85,7 @@ def run(folder, monkeypatch, *words):
     return main(["render", *words, "--size-px", "40"])
 
 
+@pytest.mark.long
 def test_image_components_and_single_document_are_written(folder, monkeypatch, capsys):
     words = ("face", "--light", "1,0.5,2", "--components", "--out", "picture", "--json")
     assert run(folder, monkeypatch, *words) == 0

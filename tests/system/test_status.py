@@ -222,6 +222,7 @@ def test_recorded_options_are_repeated(results):
     assert words[5:9] == ["--hold-out", "lights=L007,L023", "--rank", "6"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["m", "my data"])
 def test_commands_run_where_they_are_printed(session, folder, tmp_path, monkeypatch, capsys):
     """In folders whose names are parts of other words of the commands."""

@@ -26,6 +26,7 @@ def truth_of(here, melanin):
     return store.read(here / f"truth-{melanin}")
 
 
+@pytest.mark.long
 def test_subject_file_melanin_is_truth_citing_file(here, capsys):
     light, dark = (truth_of(here, melanin) for melanin in (0.02, 0.08))
     medians = [
@@ -82,6 +83,7 @@ def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
     assert manifest["subject"]["consent_scope"] == ["research", "teaching"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -98,10 +100,12 @@ def test_a_session_is_not_resumed_with_another_consent(here, capsys, killed, opt
     assert [line.strip() for line in said if "recorded" in line] == told
 
 
+@pytest.mark.long
 def test_a_consent_is_the_same_in_any_order(killed):
     assert main([*killed, "--resume", "--consent", "teaching,research"]) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["plan", "serve"])
 def test_effects_invisible_to_rig_are_reported_before_work(here, capsys, monkeypatch, command):
     (here / "ann.toml").write_text(FILE.format(melanin=0.02) + "oil = 2.0\n", encoding="utf-8")

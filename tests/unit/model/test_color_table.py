@@ -21,6 +21,7 @@ def fractions(rng, count, lowest=0.0):
     return np.minimum(u**3, C_M_MAX), np.minimum(v**3, C_HD_MAX)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("anisotropy", color_table.STORED_ANISOTROPIES)
 def test_lookup_is_band_average_of_accurate_tier(anisotropy, rng):
     c_m, c_hd = fractions(rng, 60)

@@ -70,6 +70,7 @@ def matched(layout, rng):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("made", [lit, halfway, matched])
 def test_the_layout_of_an_array_changes_nothing(made, layout):

@@ -44,6 +44,7 @@ def estimate(table, melanin, log_light, rng, *, off=0.0, has_white=True):
     return whole, estimate_face_light(whole, rgb)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("typical", [0.012, 0.15])
 def test_brightness_corrects_level_of_unknown_optics(table, typical):
     rng = np.random.default_rng(5)

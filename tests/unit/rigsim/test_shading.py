@@ -128,6 +128,7 @@ def rng_directions() -> np.ndarray:
     return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("alpha", [0.1, 0.3, 0.6])
 def test_rough_surface_reflects_no_more_than_received(alpha):
     light = unit(0.6, 0.2, 0.7)

@@ -26,6 +26,7 @@ def offered(words):
     return run.stdout.split()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

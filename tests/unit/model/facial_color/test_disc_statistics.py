@@ -44,6 +44,7 @@ def twin(h, radius_px, valid):
     return mean.astype(float), deviation.astype(float), count.astype(int)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("radius_px", RADII_PX)
 @pytest.mark.parametrize("shape", [(40, 37), (5, 70), (70, 3), (1, 1)])
 def test_disc_contains_pixels_within_radius_map_and_mask(shape, radius_px, rng):
@@ -77,6 +78,7 @@ NEARLY_CONSTANT = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", NEARLY_CONSTANT)
 @pytest.mark.parametrize("radius_px", [4.0, 16.0])
 def test_deviation_keeps_precision_on_nearly_constant_map(kind, radius_px, rng):

@@ -60,6 +60,7 @@ def test_projected_and_sampled_phase_functions_agree(monkeypatch):
     discrete_ordinates.phase_matrices.cache_clear()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("eta", [1.0, 1.02, 1.4])
 def test_default_directions_serve_mixed_layers(eta, rng):
     for _ in range(2):

@@ -68,6 +68,7 @@ def spotted(table, melanin, mole_melanin, rng):
     return c_m, moles, shades, clean * (1 + NOISE * rng.standard_normal(clean.shape))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("melanin", "mole_melanin", "explained_away"),
     [
@@ -110,6 +111,7 @@ def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, exp
     np.testing.assert_array_equal(found.stderr_hemoglobin[same], by_face.stderr_hemoglobin[same])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("melanin", [0.015, 0.05])
 def test_lips_are_not_fitted_as_low_blood_skin(table, melanin, rng):
     """4 % of a face has 0.55 times its melanin and 3.4 times its blood, in the same uneven light.

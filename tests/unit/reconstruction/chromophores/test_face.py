@@ -54,6 +54,7 @@ def known_face(table, melanin, spread, blood, blood_spread):
     )
 
 
+@pytest.mark.long
 def test_face_kernel_sum_matches_plain_numpy(table, prior, rng):
     """Narrow and wide faces, of the pixels' skin and of darker skin; two skins are possible.
 
@@ -91,6 +92,7 @@ def test_face_kernel_sum_matches_plain_numpy(table, prior, rng):
                 np.testing.assert_allclose(reach, slow[:, i, 1], rtol=0.12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("melanin", [0.01, 0.09])
 def test_shade_is_not_taken_for_darker_skin(melanin, table, prior, rng):
     """The dimmest fifth is held as the rest is, and errs less than by its pixels alone.
@@ -128,6 +130,7 @@ def test_a_mole_in_good_light_keeps_its_melanin(table, prior, rng):
     assert inside.mean() > 0.85
 
 
+@pytest.mark.long
 def test_common_light_uncertainty_widens_face_error(table, prior, rng):
     """20 % more light on all of a dark face moves its mean by what its error then says."""
     _, _, _, rgb = face(table, prior, 0.15, 2000, rng)
@@ -144,6 +147,7 @@ def test_common_light_uncertainty_widens_face_error(table, prior, rng):
     assert sure.melanin.stderr < 0.3 * unsure.melanin.stderr
 
 
+@pytest.mark.long
 def test_common_color_error_widens_face_error(table, prior, rng):
     _, _, _, rgb = face(table, prior, 0.01, 2000, rng)
     given = {"prior": prior, "common_light": 0.01, "variance": (NOISE * rgb) ** 2}

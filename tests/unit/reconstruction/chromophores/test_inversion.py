@@ -43,6 +43,7 @@ def weights_of(variance_relative, free):
     return weights
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("light", ["xenon flash", "D65", "A"])
 @pytest.mark.parametrize("shading", MODES)
 def test_round_trip_is_exact_where_skin_is_determined(shading, light):

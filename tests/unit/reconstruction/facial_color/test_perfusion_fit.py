@@ -31,6 +31,7 @@ def relaxing(phase, constant_s, delay_s=0.16, fall_s=None):
     return target + (begin - target) * np.exp(-(since % 5.0) / constant)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("phase", "constant_s"), [(PHASE, 2.0), (FINE, 2.0), (FINE, 0.5)])
 def test_a_time_constant_is_recovered_within_its_errors(phase, constant_s):
     rng = np.random.default_rng(0)
@@ -259,6 +260,7 @@ def with_step(rng, *, constant_s, step, noise=2e-4, gap=0.01):
     return curve + noise * rng.standard_normal(PHASE.size)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("constant_s", [1.0, 4.0])
 def test_pose_offset_in_samples_is_not_quick_blood(constant_s):
     """Steps are drawn from their prior: intervals hold the truth, and plain fits do not."""

@@ -46,6 +46,7 @@ def scipy_target(height, alpha, sigma_um, *, stretch, axis):
     return counts / counts.sum()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("axis", "number"), [("x", 1), ("y", 0)])
 @pytest.mark.parametrize(("alpha", "sigma_um"), [(-1.3, 9.0), (0.8, 44.5), (0.5, 3.0)])
 def test_search_histogram_matches_plain_numpy(rng, axis, number, alpha, sigma_um):
@@ -107,6 +108,7 @@ def compared(rng, side, first_sample, grid=(ALPHA_GRID, SIGMAS_UM)):
     return full, part
 
 
+@pytest.mark.long
 def test_hierarchical_search_matches_exhaustive_search(rng):
     for _ in range(4):
         full, part = compared(rng, 144, 2048, **COARSE)

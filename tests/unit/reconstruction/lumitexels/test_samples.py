@@ -202,6 +202,7 @@ def test_bad_and_missing_pixels_take_their_samples():
     assert kept[column > WIDTH // 2].any()
 
 
+@pytest.mark.long
 def test_variances_are_those_of_noisy_samples(rng):
     """One light 400 times: variance of the samples over their variance within 4 deviations.
 

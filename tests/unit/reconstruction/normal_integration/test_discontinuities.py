@@ -46,6 +46,7 @@ def plain_objective(height, normals, k):
     return total
 
 
+@pytest.mark.long
 def test_bilateral_integration_raises_flap_joined_surface_flattens():
     truth, normals, _ = flap(96, 1.0)
     joined = rms(integrate(normals), truth)
@@ -116,6 +117,7 @@ def test_masks_and_parts_are_kept():
         assert abs(found.height[found.part == part].mean()) < 1e-5
 
 
+@pytest.mark.long
 def test_single_pixel_and_single_row_have_height():
     flat = np.broadcast_to([0.1, 0.0, 1.0], (1, 9, 3))
     assert integrate_with_discontinuities(flat[:, :1]).height.shape == (1, 1)

@@ -31,6 +31,7 @@ def disc_with_holes(side):
     return disc & ((x - 40) ** 2 + (y - 45) ** 2 > 30)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("masked", [False, True])
 def test_planes_vanish_to_border_and_bulges_nearly(masked):
     side = 120

@@ -123,6 +123,7 @@ def test_file_with_pickle_is_refused(tmp_path):
             read_product(tmp_path / "a.npz")
 
 
+@pytest.mark.long
 def test_file_cut_or_changed_is_refused(tmp_path):
     """Every bit, and every length: an error of one type, or the same content."""
     path = tmp_path / "a.npz"

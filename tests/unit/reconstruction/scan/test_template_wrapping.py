@@ -38,6 +38,7 @@ def wrapped():
     return wrap_template(load_default_template(), scanned(fine=True)[0], steps=4)
 
 
+@pytest.mark.long
 def test_wrapped_template_is_on_scan_unfolded(wrapped):
     template = load_default_template()
     true = deformed(template.mesh.vertices_mm)
@@ -63,6 +64,7 @@ def test_vertices_without_scan_are_extrapolated():
     assert found.folded == 0
 
 
+@pytest.mark.long
 def test_pose_is_found_in_any_frame():
     scan, turn = scanned(rotation=(80.0, -35.0, 160.0), shift=(3e3, -5e4, 20.0))
     pose = estimate_pose(load_default_template(), ScanSurface(scan))

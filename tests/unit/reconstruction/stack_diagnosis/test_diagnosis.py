@@ -25,6 +25,7 @@ def diagnose(stack, **options):
     )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", FAULTS)
 def test_fault_is_found_with_its_images(fault):
     stack = make(fault, 300, side=64, count=12)
@@ -145,6 +146,7 @@ def test_large_stacks_are_read_image_by_image():
     assert peak < 0.6 * images.nbytes
 
 
+@pytest.mark.long
 def test_pain_suite_has_each_fault_of_the_diagnosis():
     table = Path(__file__).parents[4] / "tools" / "pain_suite.csv"
     rows = list(csv.DictReader(table.read_text().splitlines()))

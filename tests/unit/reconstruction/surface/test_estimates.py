@@ -185,6 +185,7 @@ def test_normal_stderr_matches_one_round_and_bounds_two(rng):
     assert np.sum((apart / stated.stderr[both, 0]) ** 2) > 3 * degrees
 
 
+@pytest.mark.long
 def test_half_vector_normals_are_accurate_to_light_spacing():
     truth = cap()
     samples = make(truth, lights=150, lobe=lambda h: 5.0 * np.exp(-((h / 0.15) ** 2)))

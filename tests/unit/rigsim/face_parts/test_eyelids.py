@@ -53,6 +53,7 @@ def _clearance(mesh, lids, displacement, faces):
     return _triangle_distance(corners[near]).min() - eyelids.APEX_MM
 
 
+@pytest.mark.long
 def test_weight_zero_moves_no_vertex(head):
     _, eyes = head
     for lids in eyes:
@@ -60,6 +61,7 @@ def test_weight_zero_moves_no_vertex(head):
         assert np.abs(lids.displacement_mm(1.0)).max() > 8.0
 
 
+@pytest.mark.long
 def test_eyeball_stays_behind_lids_at_any_weight(head):
     mesh, eyes = head
     for lids in eyes:
@@ -69,12 +71,14 @@ def test_eyeball_stays_behind_lids_at_any_weight(head):
             assert _clearance(mesh, lids, lids.displacement_mm(weight), faces) >= 0.0
 
 
+@pytest.mark.long
 def test_straight_opening_without_arc_pierces_lids(head):
     mesh, (lids, _) = head
     straight = 0.5 * lids.opening_mm
     assert _clearance(mesh, lids, straight, _open_faces(mesh, lids)) < 0.0
 
 
+@pytest.mark.long
 def test_margins_are_only_new_border(head):
     """Each eye opens one loop, through its margins' vertices and no other."""
     mesh, eyes = head
@@ -92,6 +96,7 @@ def test_margins_are_only_new_border(head):
         assert margin <= set(used) <= margin | set(lids.upper) | set(lids.lower)
 
 
+@pytest.mark.long
 def test_open_fissure_has_size_of_adults(head):
     """Width 27 to 33 mm and height 8 to 12 mm, adults of Farkas 1994."""
     mesh, eyes = head
@@ -103,6 +108,7 @@ def test_open_fissure_has_size_of_adults(head):
         assert 8.0 <= (upper[:, 1] - lower[:, 1]).max() <= 12.0
 
 
+@pytest.mark.long
 def test_eyes_are_mirror_images(head):
     _, (right, left) = head
     np.testing.assert_allclose(left.center_mm, right.center_mm * (-1.0, 1.0, 1.0), atol=1e-3)

@@ -35,6 +35,7 @@ def worst(one, other):
     return np.abs(difference / np.hypot(one.stderr, other.stderr)).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("harmonics", [8, None])
 def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
     run = traced(replace(ALONG, strength=0.0), (0.4,), seed=1, harmonics=harmonics)
@@ -57,6 +58,7 @@ def test_light_travels_farther_along_fibers_than_across():
     assert along - across > 4.5 * np.hypot(*run.stderr[0])
 
 
+@pytest.mark.long
 def test_harmonics_agree_with_fibers_scored_at_their_positions():
     angles = (0.0, 0.5, 1.0, 0.5 * pi)
     assert worst(traced(ALONG, angles, seed=4), traced(ALONG, angles, seed=5, harmonics=None)) < 4.5

@@ -112,6 +112,7 @@ def test_wrinkles_shade_moved_face_equally_in_both_renderers(face):
     assert differ.mean() < 0.002  # rays that two tracers judge differently
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["neutral", "surprise"])
 def test_relief_shades_face_at_rest_and_moved(face, state):
     rig = load_rig("flash").resized(64)

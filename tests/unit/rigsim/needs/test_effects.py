@@ -109,6 +109,7 @@ def test_interreflection_is_zero_on_plate_not_in_corner():
     assert 0.15 < effect_sizes.max_exchange_fraction(corner) < 0.5
 
 
+@pytest.mark.long
 def test_groove_occludes_sky_like_two_walls():
     """In a V of 90 degrees the other wall, of length L, hides (1 - d / sqrt(L^2 + d^2)) / 2 of the
     sky of a point a distance d from the bottom. Tolerance: sectors, and a groove of finite length.

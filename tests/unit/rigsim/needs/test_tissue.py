@@ -70,6 +70,7 @@ def test_typical_tissue_is_absent_and_not_evaluated():
     assert [effect.verdict for effect in made] == ["absent"] * len(TISSUE_RULES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rule", TISSUE_RULES, ids=lambda rule: rule.switch)
 def test_tissue_size_bounds_change_of_face(rule, flash, face):
     """The bound may exceed the change as it takes the brightest skin; 30 times at most."""
@@ -105,6 +106,7 @@ def test_dim_light_needs_fewer_properties(flash, face):
     assert not any(dim.builds(name) for name in PROPERTIES)
 
 
+@pytest.mark.long
 def test_thickness_of_sites_alone_is_built(flash, face):
     person = dataclasses.replace(face, tissue=TissueProperties(site_contrast=1.0))
     scenes = [
@@ -134,6 +136,7 @@ def test_patch_of_changed_tissue_equals_drawn_patch():
     assert change_patch_tissue(one, TYPICAL_SKIN) is one
 
 
+@pytest.mark.long
 def test_tissue_size_bounds_change_of_patch():
     rig = load_rig("gradient").cropped(32)
     patch = make_micro_skin("cheek", seed=2, size_mm=0.8, person=PersonSkin(0.02, tissue=PERSON))
@@ -149,6 +152,7 @@ def test_tissue_size_bounds_change_of_patch():
     assert predicted / 30.0 < change <= predicted
 
 
+@pytest.mark.long
 def test_predicted_fiber_profiles_agree_with_photons():
     """Logarithm of the ratio of two people's readings, mean over 14 fibers; photon noise 0.06."""
     rig, person = load_rig("probe"), PersonSkin(0.03, tissue=PERSON)
@@ -167,6 +171,7 @@ def test_predicted_fiber_profiles_agree_with_photons():
     assert np.abs(predicted[near].mean(axis=0)).min() > 0.8
 
 
+@pytest.mark.long
 def test_probe_builds_what_readings_show():
     rig = load_rig("probe")
     shown, hidden = (

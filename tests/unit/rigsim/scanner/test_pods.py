@@ -67,12 +67,14 @@ def test_the_file_holds_the_mesh():
     np.testing.assert_array_equal(np.asarray(loaded.vertices, np.float32), scanned().vertices_mm)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("triangles", [4_000, 30_000])
 def test_triangle_count_is_near_request(triangles):
     found = scanned(triangles=triangles, **CLEAN)
     assert len(found.faces) == pytest.approx(triangles, rel=0.2)
 
 
+@pytest.mark.long
 def test_scanned_surface_matches_truth_and_faces_outward():
     """Median error below 0.1 mm; the frames' offset left in, it is a hundred times larger."""
     scan = scanned(triangles=30_000, resolution_mm=1.0, **CLEAN)

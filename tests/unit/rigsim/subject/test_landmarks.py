@@ -33,6 +33,7 @@ def scenes(rig: Rig, face: SimulatedSubject) -> dict[str, FlashScene]:
     }
 
 
+@pytest.mark.long
 def test_landmarks_are_on_skin_at_mean_head_positions(face):
     points = face.surface_landmarks()
     assert set(points.names) == set(landmarks.POINTS_MM)
@@ -44,6 +45,7 @@ def test_landmarks_are_on_skin_at_mean_head_positions(face):
     assert points.weights.min() > -1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["neutral", "smile", "surprise"])
 def test_position_map_gives_landmarks_at_their_superpixels(scenes, state):
     """Rationale: half a pixel of the sensor is a quarter of a superpixel.
@@ -78,6 +80,7 @@ def test_position_map_gives_landmarks_at_their_superpixels(scenes, state):
     assert np.median(np.abs(errors_mm(0.25))) > 0.7 * quarter_mm
 
 
+@pytest.mark.long
 def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
     """Expected: f / (D - z) times the movement of the nearest vertex, plus what coming nearer
     enlarges. Tolerance: 0.15 px, as movement changes by a few percent from vertex to vertex."""
@@ -102,6 +105,7 @@ def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
     assert corner[1] < -2.0
 
 
+@pytest.mark.long
 def test_landmarks_hidden_by_head_are_not_visible(rig, face):
     caster = Caster(face.mesh, choice=EMBREE)
     points = face.surface_landmarks().positions_on(face.mesh)

@@ -32,6 +32,7 @@ def test_same_seed_makes_same_face_another_seed_another(face):
     assert np.abs(face.mesh.vertices_mm - other.mesh.vertices_mm).max() > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_every_preset_stays_inside_skin_model_ranges(preset):
     face = make_subject(preset, seed=1, size=96)

@@ -190,6 +190,7 @@ def test_smile_fills_cheek_bones_drains_stretched_lips(person):
     assert change(wrong, bones) < 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", sorted(EXPRESSION_STRENGTHS))
 def test_mechanical_change_grows_with_amount_within_limits(person, state):
     """Over the skin that moves; single texels may fill first and drain when they fold."""

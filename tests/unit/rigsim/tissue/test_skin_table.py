@@ -84,17 +84,20 @@ def p_value(scores):
     return 1.0 - (1.0 - 2.0 * stats.t.sf(np.abs(scores).max(), 39)) ** scores.size
 
 
+@pytest.mark.long
 def test_table_agrees_with_photons_traced_now(first_four):
     # The very layers of the entry, traced without the table's reweighting. False alarms: 1e-4.
     table, photons = first_four
     assert p_value(z_values(table, ENTRIES[:4], photons)) > FALSE_ALARM
 
 
+@pytest.mark.long
 def test_table_two_percent_off_does_not_agree(first_four):
     table, photons = first_four
     assert p_value(z_values(table, ENTRIES[:4], photons, factor=1.02)) < FALSE_ALARM
 
 
+@pytest.mark.long
 def test_table_of_another_tissue_does_not_agree(first_four):
     table, photons = first_four
     for other in TISSUES:
@@ -386,6 +389,7 @@ def excess_deviation(table, batches, c_m, c_hd, *, tabulated_nm):
     return np.abs(table.lateral_kernels(c_m, c_hd).encircled[w] - live).max() - noise
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("nm", "c_m", "c_hd", "photons"), LIVE_KERNELS)
 def test_kernels_agree_with_photons_of_their_wavelength(table, nm, c_m, c_hd, photons):
     # Interpolation between nodes is off by 0.0021 of the light at most (420 nm, no noise).

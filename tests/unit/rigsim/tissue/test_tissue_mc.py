@@ -136,6 +136,7 @@ def test_kernel_agrees_with_plain_numpy_whole_photon_walk():
     assert smallest_p_value(STACK) > 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [{"g": 0.75}, {"eta": 1.45}, {"sigma_s_per_mm": 9.5}])
 def test_that_agreement_would_show_a_wrong_first_layer(wrong):
     first, *others = STACK.layers

@@ -36,6 +36,7 @@ def seen(skin) -> CapturedSamples:
     return brdf_space_datasets.sample_surface(*skin, 120, rng=np.random.default_rng(1))
 
 
+@pytest.mark.long
 def test_samples_are_true_reflection_with_stated_noise(seen):
     assert np.all(np.einsum("pmc,pc->pm", seen.light, seen.normals) >= 0.119)
     pull = (seen.f - seen.clean) / np.sqrt(seen.variance)
@@ -48,6 +49,7 @@ def test_samples_are_true_reflection_with_stated_noise(seen):
     np.testing.assert_array_equal(again.clean, seen.clean[:10])
 
 
+@pytest.mark.long
 def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
     """Root of the squared error over that of the surface term, in the pairs that were measured."""
     fit = brdf_space_datasets.fit_materials(seen, basis)
@@ -70,6 +72,7 @@ def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
     assert np.linalg.norm(other - seen.surface) > 0.2 * np.linalg.norm(seen.surface)
 
 
+@pytest.mark.long
 def test_points_without_diffuse_are_fitted_by_lobes_alone(skin, basis):
     surface, place, where = skin
     black = dataclasses.replace(surface, r_d=np.zeros_like(surface.r_d))
@@ -83,6 +86,7 @@ def test_points_without_diffuse_are_fitted_by_lobes_alone(skin, basis):
     assert np.all(fit.weights @ basis.strength() > 0.0)
 
 
+@pytest.mark.long
 def test_the_darkest_person_has_a_surface_too(basis):
     dark = dataclasses.replace(PERSON, melanin=population.POPULATION_MELANIN_RANGE[1])
     rng = np.random.default_rng(4)
@@ -105,6 +109,7 @@ def test_single_condition_is_dataset_and_conditions_share_points():
     assert 0.0 < two.noise < 1.0
 
 
+@pytest.mark.long
 def test_mean_brdf_peaks_higher_under_lotion_than_powder(basis):
     rng = np.random.default_rng(6)
     data = brdf_space_datasets.build_dataset_a(
@@ -122,6 +127,7 @@ def test_mean_brdf_peaks_higher_under_lotion_than_powder(basis):
         assert png.startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_unsampleable_input_is_refused(skin, rng):
     surface, place, where = skin
     with pytest.raises(DatasetError, match="samples: got 5000"):
@@ -153,6 +159,7 @@ def appearance(basis, rank, rng, *, names=None):
     return SkinAppearance(maps, "simulated", seed=0, files={"brdf_basis.npz": stream.getvalue()})
 
 
+@pytest.mark.long
 def test_measured_faces_are_analyzed_by_label(tmp_path, basis, capsys):
     rng = np.random.default_rng(7)
     agreed = {"pseudonym": "P7", "consent_scope": ["research"], "consent_expires": "2031-01-31"}
@@ -187,6 +194,7 @@ def test_measured_faces_are_analyzed_by_label(tmp_path, basis, capsys):
     assert "research, until 2031-01-31" in page
 
 
+@pytest.mark.long
 def test_faces_without_usable_lobes_are_named(tmp_path, basis, capsys):
     rng = np.random.default_rng(8)
     bare = SkinAppearance({"r_d": SkinMap(np.ones((8, 8), np.float32), "1")}, "simulated", seed=0)

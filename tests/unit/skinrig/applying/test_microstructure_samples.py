@@ -81,6 +81,7 @@ def test_strain_image_angle_is_axis_of_s(relief):
     assert abs(middle[2]) == pytest.approx(np.pi / 2, abs=0.05)
 
 
+@pytest.mark.long
 def test_apply_sample_by_command_prints_one_document(tmp_path, capsys):
     argv = ["apply", "microstructure", "--on", "sphere", "--size-px", "128"]
     assert main([*argv, "--out", str(tmp_path / "s"), "--json"]) == 0

@@ -188,6 +188,7 @@ def test_probe_drags_skin_in_contact():
     np.testing.assert_allclose(moved[:, 2], tip)
 
 
+@pytest.mark.long
 def test_skin_is_rougher_before_moving_probe_smoother_behind(rng):
     """Where the push compresses along x, slopes along x grow; where it stretches, they shrink."""
     patch = pushed_patch.push_block(

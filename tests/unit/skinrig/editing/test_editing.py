@@ -48,6 +48,7 @@ def rms(a, b, where):
     return float(np.sqrt(np.mean((a[where].astype(float) / b[where] - 1.0) ** 2)))
 
 
+@pytest.mark.long
 def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     folder, paths, _ = lab
     out = folder / "zero"
@@ -63,6 +64,7 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     )
 
 
+@pytest.mark.long
 def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
     done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}), library)
     assert done.changed == ("r_d",)
@@ -78,6 +80,7 @@ def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
     assert done.record["albedo"]["distance_after"] < done.record["albedo"]["distance_before"]
 
 
+@pytest.mark.long
 def test_edit_and_opposite_return_source_within_stated_error(source, library):
     order = EditRequest(traits={"tan": 0.8, "oily": 0.6})
     there = editing.edit_face(source, order, library)
@@ -101,6 +104,7 @@ def test_edit_and_opposite_return_source_within_stated_error(source, library):
     assert back.record["before"]["traits"] == {"tan": 0.8, "oily": 0.6}
 
 
+@pytest.mark.long
 def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     done = editing.edit_face(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
@@ -125,6 +129,7 @@ def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     assert lobes.size == done.record["surface"]["lobes"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("traits", [{"tan": 1.0}, {"oily": 1.0}])
 def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     shape = source.r_d.values.shape[:2]
@@ -143,6 +148,7 @@ def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     assert most > 0.05
 
 
+@pytest.mark.long
 def test_region_edit_changes_beard_not_forehead(source, library):
     done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}, region="beard"), library)
     height = source.position[..., 1]
@@ -153,6 +159,7 @@ def test_region_edit_changes_beard_not_forehead(source, library):
     assert ratio[chin].mean() < 0.9
 
 
+@pytest.mark.long
 def test_edit_has_no_seam_between_texture_islands(source, library):
     """Both sides of the cut at height 0 darken alike."""
     done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}), library)
@@ -164,6 +171,7 @@ def test_edit_has_no_seam_between_texture_islands(source, library):
     assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(within**2)) + 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kind", [{"flat": True}, {"color": (0.02, 0.012, 0.009)}, {"color": (0.97, 0.96, 0.95)}]
 )
@@ -186,6 +194,7 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
         assert change < 0 if amount > 0 else change >= 0
 
 
+@pytest.mark.long
 def test_reflectance_above_white_is_kept_but_never_made(source, library):
     r_d = source.r_d
     values = r_d.values.copy()
@@ -199,6 +208,7 @@ def test_reflectance_above_white_is_kept_but_never_made(source, library):
     assert new[r_d.valid & ~outlier].max() <= 1.0
 
 
+@pytest.mark.long
 def test_face_without_lobes_is_edited_in_albedo(source, library):
     maps = {n: m for n, m in source.appearance.maps.items() if not n.startswith("basis")}
     face = dataclasses.replace(
@@ -209,6 +219,7 @@ def test_face_without_lobes_is_edited_in_albedo(source, library):
         editing.edit_face(face, EditRequest(traits={"oily": 1.0}, parts=("surface",)), library)
 
 
+@pytest.mark.long
 def test_the_same_seed_makes_the_same_face(source, library):
     order = EditRequest(traits={"tan": 1.0}, spots=(SpotRequest("freckles", 1.0),), seed=5)
     one, two = (editing.edit_face(source, order, library).appearance.maps["r_d"] for _ in range(2))
@@ -217,6 +228,7 @@ def test_the_same_seed_makes_the_same_face(source, library):
     assert not np.array_equal(other.appearance.maps["r_d"].values, one.values)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("argv", "code", "says"),
     [
@@ -248,6 +260,7 @@ def test_invalid_edit_gives_clear_error_and_writes_nothing(argv, code, says, lab
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_invalid_masks_are_refused_by_name(source, library, tmp_path):
     (tmp_path / "black.png").write_bytes(png.encode(np.zeros((64, 64), np.uint8)))
     (tmp_path / "wide.png").write_bytes(png.encode(np.ones((32, 64), np.uint8)))
@@ -259,6 +272,7 @@ def test_invalid_masks_are_refused_by_name(source, library, tmp_path):
             )
 
 
+@pytest.mark.long
 def test_an_interrupted_edit_leaves_nothing_half_written(lab, monkeypatch):
     folder, paths, _ = lab
     out = folder / "halted"
@@ -276,6 +290,7 @@ def test_an_interrupted_edit_leaves_nothing_half_written(lab, monkeypatch):
     assert {p.name for p in folder.iterdir()} == before
 
 
+@pytest.mark.long
 def test_json_is_single_document_of_performed_edit(lab, capsys):
     folder, paths, _ = lab
     argv = ["edit", str(paths[0]), "--space", str(folder / "traits.npz"), "--json"]
@@ -286,12 +301,14 @@ def test_json_is_single_document_of_performed_edit(lab, capsys):
     assert told["warnings"]
 
 
+@pytest.mark.long
 def test_the_source_is_never_written_over(lab, capsys):
     _, paths, _ = lab
     assert main(["edit", str(paths[0]), "--spots", "moles=1", "--out", str(paths[0])]) == 3
     assert "is the source" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("table", "says"),
     [
@@ -314,6 +331,7 @@ def test_bad_labels_give_single_clear_error(table, says, lab, tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_faces_without_landmarks_are_refused_with_remedy(lab, tmp_path, dome_faces, capsys):
     _, paths, labels = lab
     bare = store.write(tmp_path / "appearance-1", dome_faces.face(1))
@@ -324,6 +342,7 @@ def test_faces_without_landmarks_are_refused_with_remedy(lab, tmp_path, dome_fac
     assert "1.csv" in err
 
 
+@pytest.mark.long
 def test_groups_of_fewer_than_five_are_warned_of(lab, capsys):
     folder, paths, labels = lab
     argv = ["fit", "traits", *map(str, paths), "--labels", str(labels), "--json"]
@@ -333,6 +352,7 @@ def test_groups_of_fewer_than_five_are_warned_of(lab, capsys):
     assert {row["trait"] for row in told["rows"]} == {"tan", "oily", "age"}
 
 
+@pytest.mark.long
 def test_landmark_table_in_texels_matches_mesh_landmarks(source, tmp_path):
     rows, columns = np.nonzero(source.surface)
     picked = {"nose tip": (int(columns[5]), int(rows[5])), "chin": (int(columns[9]), int(rows[9]))}
@@ -349,6 +369,7 @@ def test_landmark_table_in_texels_matches_mesh_landmarks(source, tmp_path):
         face_textures.read_landmarks(table, source)
 
 
+@pytest.mark.long
 def test_map_without_error_or_mask_is_edited(source, library):
     bare = {
         n: SkinMap(m.values, m.unit) for n, m in source.appearance.maps.items() if n != "position"

@@ -77,6 +77,7 @@ def exported(appearance, tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("to", "suffix"), [("merl", ".binary"), ("rgl", ".bsdf")])
 def test_exported_lobes_are_white_and_match_model(to, suffix, exported, lobes, rng):
     """Tolerance: half a bin of MERL, or interpolation of RGL, moves the edge of a lobe by 5 %."""
@@ -91,6 +92,7 @@ def test_exported_lobes_are_white_and_match_model(to, suffix, exported, lobes, r
         assert other > 0.2  # it can fail
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("to", "suffix"), [("merl", ".binary"), ("rgl", ".bsdf")])
 def test_exported_position_is_mixture_plus_subsurface_light(to, suffix, exported, lobes, rng):
     light, view = directions(rng, 2000), directions(rng, 2000)
@@ -105,6 +107,7 @@ def test_exported_position_is_mixture_plus_subsurface_light(to, suffix, exported
     assert np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)) < 0.06
 
 
+@pytest.mark.long
 def test_document_reports_light_size_and_file_contents(exported, lobes):
     told = json.loads((exported / "merl" / "brdfs.json").read_text())
     assert told["light_radius_rad"] == lobes[2].light_radius_rad
@@ -117,6 +120,7 @@ def test_document_reports_light_size_and_file_contents(exported, lobes):
     assert (exported / "rgl" / "ascmhl").is_dir()
 
 
+@pytest.mark.long
 def test_below_the_horizon_nothing_was_measured(exported):
     table = merl.read(exported / "merl" / "place.binary")
     light, view = merl.to_directions(*np.meshgrid(*merl.bin_centers(), indexing="ij"))
@@ -125,6 +129,7 @@ def test_below_the_horizon_nothing_was_measured(exported):
     assert np.all(table.stored[:, ~above] == -1.0)
 
 
+@pytest.mark.long
 def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
     place = SkinPosition(0.5, 0.5, radius_mm=100.0, diffuse=False)
     done = export(appearance, tmp_path / "all", to="rgl", delivery=ExportSettings(place=place))
@@ -134,6 +139,7 @@ def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
     assert np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)) < 0.06
 
 
+@pytest.mark.long
 def test_positions_without_reflectance_are_named(appearance, tmp_path):
     with pytest.raises(ExportError, match="row 0, column 4"):
         write(store.read(appearance), tmp_path, SkinPosition(0.5, 1.0), "rgl")
@@ -148,6 +154,7 @@ def test_positions_without_reflectance_are_named(appearance, tmp_path):
         write(store.read(tmp_path / "dark"), tmp_path, SkinPosition(0.5, 0.5), "rgl")
 
 
+@pytest.mark.long
 def test_command_line_exports_and_reports_errors(appearance, tmp_path, capsys):
     out = str(tmp_path / "out")
     assert main(["export", str(appearance), "--to", "rgl", "--at", "0.2,0.4", "--out", out]) == 0

@@ -94,6 +94,7 @@ def smiling(patch, tmp_path):
     return write
 
 
+@pytest.mark.long
 def test_fitted_wrinkles_leave_within_the_consent_alone(dome, smiling, tmp_path):
     faces = [dome("n", state="neutral"), smiling("s")]
     fit_wrinkles(faces, out=tmp_path / "moving", size=32, mask_size=16)
@@ -224,6 +225,7 @@ def consent_of(html):
     return found.group() if found else ""
 
 
+@pytest.mark.long
 def test_report_names_subjects_and_permitted_uses(dome, tmp_path):
     shown = tmp_path / "shown"
     shown.mkdir()

@@ -96,6 +96,7 @@ def both(folders, **more):
     )
 
 
+@pytest.mark.long
 def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
     found = fuse(both(folders), out=tmp_path / "double").appearance
     true = REFLECTANCE * np.exp(LOG_R_D_OVER_REFLECTANCE)

@@ -31,6 +31,7 @@ def small(monkeypatch, look):
     monkeypatch.setattr(flash, "simulate_observation", lambda *args, **kwargs: look)
 
 
+@pytest.mark.long
 def test_more_frames_and_darks_lower_error_to_model(look):
     def median(**settings):
         return flash.predict(look, **settings).median("melanin")
@@ -44,6 +45,7 @@ def test_more_frames_and_darks_lower_error_to_model(look):
     assert floor < median(repeats=16, power=1.0, darks=4) < 1.2 * floor
 
 
+@pytest.mark.long
 def test_common_error_is_that_of_image(rig):
     table, _ = load_skin_colors(
         rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, has_white=True
@@ -69,6 +71,7 @@ def test_common_error_is_that_of_image(rig):
     assert yellow["melanin"] > own["melanin"] + 0.03
 
 
+@pytest.mark.long
 def test_four_frames_halve_noise_error(look):
     still = replace(look, gain=0.0, floor=0.0)
 
@@ -83,6 +86,7 @@ def test_four_frames_halve_noise_error(look):
     assert np.median(noise(1) / noise(4)) == pytest.approx(2.0, rel=0.05)
 
 
+@pytest.mark.long
 def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     want = "melanin<=8%,hemoglobin<=20%"
@@ -106,6 +110,7 @@ def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys
         assert other["median"] == pytest.approx(one["median"], rel=1e-9)
 
 
+@pytest.mark.long
 def test_dominant_model_error_does_not_request_more_frames(small, capsys):
     assert main(["plan", "flash", "--goals", "melanin<=1%"]) == 1
     said = capsys.readouterr().out
@@ -113,6 +118,7 @@ def test_dominant_model_error_does_not_request_more_frames(small, capsys):
     assert "NOT REACHED" in said
 
 
+@pytest.mark.long
 def test_undetermined_hemoglobin_does_not_count_as_reached(small, rig, monkeypatch):
     seen = flash.predict
 
@@ -128,6 +134,7 @@ def test_undetermined_hemoglobin_does_not_count_as_reached(small, rig, monkeypat
     assert not any("reaches" in why for _, why in told.left_out)
 
 
+@pytest.mark.long
 def test_plan_without_crossed_frames_or_foreign_is_refused(rig, small, tmp_path, capsys):
     whole = flash_plan(rig)
     bare = replace(

@@ -61,6 +61,7 @@ def test_quickest_scan_reaching_error_is_chosen(small, tmp_path, capsys):
     assert again["forecasts"][0]["median"] == pytest.approx(last["normals_deg"], rel=1e-9)
 
 
+@pytest.mark.long
 def test_budget_chooses_least_error_within_time(small, rig):
     found = gradient.choose(rig, plans.PlanRequest(budget_s=60.0))
     assert found.run_times["total"] <= 60.0

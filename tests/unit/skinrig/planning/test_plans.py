@@ -84,6 +84,7 @@ def test_darker_skin_and_fewer_cameras_raise_error(rig, look):
     assert look.information(range(4)).weight.sum() < every
 
 
+@pytest.mark.long
 def test_albedo_forecast_uses_subject_detail_and_specular(rig, look):
     """Coarser pixels and darker skin, where the same gloss is more, leave more error."""
     every = range(len(rig.views)), range(len(rig.lights))

@@ -33,6 +33,7 @@ def small(monkeypatch, look):
     monkeypatch.setattr(probe, "LONGEST_EXPOSURE_CHOICES_S", (0.5, 4.0))
 
 
+@pytest.mark.long
 def test_longer_exposures_and_placements_approach_common_error(look):
     def sigma(*exposures_s, repeats=1, darks=2):
         found = probe.predict(look, ProbeSettings(SITES, exposures_s, repeats, darks))
@@ -45,6 +46,7 @@ def test_longer_exposures_and_placements_approach_common_error(look):
     assert sigma(0.00115, 0.01, darks=1) > short
 
 
+@pytest.mark.long
 def test_fits_shared_by_plans_keep_forecast_bit_exactly(look):
     memory = {}
     settings = [
@@ -81,6 +83,7 @@ def test_interval_is_wide_when_fits_share_error():
     assert 0.7 < low < 1.0 < high < 1.4
 
 
+@pytest.mark.long
 def test_reading_variance_follows_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
@@ -96,6 +99,7 @@ def test_reading_variance_follows_photons_and_saturation(look):
     assert (dim / four < 4.01).all()
 
 
+@pytest.mark.long
 def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     assert main(["plan", "probe", "--goals", "sigma_tr<=4%", "--out", str(file), "--json"]) == 0
@@ -110,6 +114,7 @@ def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     assert again["forecasts"][0]["median"] == pytest.approx(document["forecasts"][0]["median"])
 
 
+@pytest.mark.long
 def test_budget_lowers_error_and_keeps_time(small, rig):
     times = []
     for budget_s in (40.0, 60.0, 120.0):
@@ -122,6 +127,7 @@ def test_budget_lowers_error_and_keeps_time(small, rig):
     assert times[0][1] < times[-1][1]
 
 
+@pytest.mark.long
 def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):
     assert main(["plan", "probe", "--goals", "sigma_tr<=0.001%"]) == 1
     said = capsys.readouterr().out
@@ -129,6 +135,7 @@ def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):
     assert "certificate" in said
 
 
+@pytest.mark.long
 def test_site_is_omitted_only_if_others_determine_quantity(look):
     setting = ProbeSettings(SITES, exposure_series_s(), 1, 2)
     plan = probe_plan(load_rig("probe"), sites=SITES)
@@ -148,6 +155,7 @@ def test_site_is_omitted_only_if_others_determine_quantity(look):
     assert probe.read_settings(fewer).sites == kept.sites
 
 
+@pytest.mark.long
 def test_plans_without_skin_or_darks_are_refused(rig):
     plan = probe_plan(rig, sites=SITES)
     for kind, word in (("fibers", "no series on skin"), ("dark", "no dark frame")):

@@ -80,6 +80,7 @@ def test_run_times_are_linear_in_frame_pixels(rig):
     assert one.total_s == pytest.approx(sum(one.by_phase().values()) / 2.0)
 
 
+@pytest.mark.long
 def test_plan_command_keeps_budget(monkeypatch, rig, tmp_path, capsys):
     monkeypatch.setattr(flash_observation, "TEXTURE_TEXELS", 128)
     look = flash.simulate_observation(rig, "III", width_px=WIDTH_PX)

@@ -186,6 +186,7 @@ def texts_of(html):
     return re.sub(r"\([a-z0-9_]+\)", "", text)  # names of files behind labels
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("word", BANNED)
 def test_report_texts_have_no_banned_word(reports, word):
     for name, html in reports.items():
@@ -193,12 +194,14 @@ def test_report_texts_have_no_banned_word(reports, word):
         assert found is None, f"{name}: {found[0]}"
 
 
+@pytest.mark.long
 def test_report_texts_write_ground_truth(reports):
     for html in reports.values():
         results = texts_of(html).split("provenance")[0]  # behind it: names of parameters
         assert not re.search(r"(?<!ground )\btruths?\b", results)
 
 
+@pytest.mark.long
 def test_report_sentences_have_at_most_25_words(reports):
     for html in reports.values():
         for text in re.findall(r"<(?:p|li|caption|h2|h3)\b[^>]*>(.*?)</", html, re.DOTALL):
@@ -206,6 +209,7 @@ def test_report_sentences_have_at_most_25_words(reports):
                 assert len(re.findall(r"[\w'-]+", sentence)) <= 25, sentence
 
 
+@pytest.mark.long
 def test_first_images_come_before_the_first_section(reports):
     html = reports["flash"]
     assert html.index('class="verdict') < html.index("<img") < html.index("<h2")

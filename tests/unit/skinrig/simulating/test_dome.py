@@ -32,6 +32,7 @@ def test_reduced_dome_lights_are_evenly_distributed():
     assert first < 20.0  # the first 24 as they come lie together: the test can fail
 
 
+@pytest.mark.long
 def test_simulating_a_dome_loads_nothing_that_only_evaluates():
     code = (
         "import sys, skinrig.simulating.dome\n"

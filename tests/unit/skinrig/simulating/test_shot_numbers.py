@@ -42,6 +42,7 @@ def pixels(folder):
     return {(r.step_id, r.camera): session.read(r).cfa for r in session.frames()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rig", "count"), [("flash", 2), ("dome", 3), ("dome", 8), ("probe", 3)])
 def test_resumed_session_has_pixels_of_uninterrupted_session(tmp_path, monkeypatch, rig, count):
     simulate_session(rig, tmp_path / "whole", **ASKED[rig])
@@ -60,6 +61,7 @@ def test_resumed_session_has_pixels_of_uninterrupted_session(tmp_path, monkeypat
         np.testing.assert_array_equal(parts[key], frame, err_msg=str(key))
 
 
+@pytest.mark.long
 def test_shots_of_retaped_caliper_skin_have_independent_noise(tmp_path, monkeypatch):
     from rigsim.world.world import World
 

@@ -363,6 +363,7 @@ def kill_at_commit(bench, number):
     bench.session.commit = commit
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [1, 2, 5, 8, 11, 14, 25])
 def test_capture_resumes_after_any_interruption(make, number):
     bench = make(short(steps=(-1, 2)))

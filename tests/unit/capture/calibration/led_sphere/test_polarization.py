@@ -55,6 +55,7 @@ def spots(
     return readings, counted / amount, variance / amount**2, good, truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("turn_deg", "seed"), [(1.0, 2), (1.0, 3), (3.0, 2)])
 def test_far_axes_converge_from_two_readings(turn_deg, seed, caplog):
     """Gauss and Newton's steps alone halve the distance of a crossed light, and reach the limit."""

@@ -308,6 +308,7 @@ def chrome_images(test_data):
     return images, cv2.imread(str(folder / "chrome.mask.png"), 0) > 127
 
 
+@pytest.mark.long
 def test_stray_pixel_of_ball_mask_changes_nothing(test_data):
     images, mask = chrome_images(test_data)
     stray = mask.copy()
@@ -328,6 +329,7 @@ def test_outline_of_large_ball_needs_little_memory():
     assert peak < 100e6
 
 
+@pytest.mark.long
 def test_wrong_ball_masks_are_refused(test_data):
     images, mask = chrome_images(test_data)
     half = mask.copy()

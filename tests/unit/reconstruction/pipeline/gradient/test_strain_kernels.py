@@ -99,6 +99,7 @@ def fitted(relief):
     return strains, counted, document, fractions
 
 
+@pytest.mark.long
 def test_known_kernels_are_recovered_at_both_angles(fitted):
     _, _, document, _ = fitted
     for fit in document["fits"]:
@@ -111,6 +112,7 @@ def test_known_kernels_are_recovered_at_both_angles(fitted):
         assert fit["distance"] < 0.6 * fit["distance_before"]
 
 
+@pytest.mark.long
 def test_variances_change_more_along_the_jaws_than_across(fitted):
     strains, counted, _, _ = fitted
     rows = {row["name"]: row for row in histogram_document(strains, counted)["states"]}
@@ -120,6 +122,7 @@ def test_variances_change_more_along_the_jaws_than_across(fitted):
         assert along[0] / along[1] > 1.5 * max(across[0] / across[1], 1.0)
 
 
+@pytest.mark.long
 def test_variance_errors_include_detail_hidden_in_images(fitted):
     """As a share of the variance beside the scatter over patches, which large patches outgrow."""
     strains, counted, _, _ = fitted
@@ -135,6 +138,7 @@ def test_variance_errors_include_detail_hidden_in_images(fitted):
             )
 
 
+@pytest.mark.long
 def test_variances_lose_noise_and_regain_hidden_slopes(fitted):
     strains, counted, _, _ = fitted
     plain = histogram_document(strains, counted)["states"]
@@ -187,6 +191,7 @@ def test_noisy_relief_has_variances_of_clean_one(steepness, angle_deg):
     assert min(errors[1]) > 1.5 * max(errors[0]), errors
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
 def test_state_is_counted_in_blocks_that_show_skin(relief, angle_deg):
     """Skin moved and stretched, counted in the neutral map's blocks, against counting it there.
@@ -229,6 +234,7 @@ def test_state_is_counted_in_blocks_that_show_skin(relief, angle_deg):
     assert np.median(own) < 0.5 * np.median(other)
 
 
+@pytest.mark.long
 def test_progress_is_reported_and_direction_is_irrelevant(fitted):
     _, _, document, fractions = fitted
     assert fractions == [0.0, 0.25, 0.5, 0.75]
@@ -236,6 +242,7 @@ def test_progress_is_reported_and_direction_is_irrelevant(fitted):
         assert document["direction"]["p_alpha"] > 1e-3
 
 
+@pytest.mark.long
 def test_state_near_neutral_or_unstrained_has_no_kernel(relief):
     lost = state(0.0, 2, 1.2)
     lost = StateStrain(
@@ -255,6 +262,7 @@ def test_state_near_neutral_or_unstrained_has_no_kernel(relief):
     assert document["tables"] == []
 
 
+@pytest.mark.long
 def test_only_skin_that_both_states_show_is_counted(relief):
     wide = state(0.0, 1, 1.25)
     strains = [state(0.0, 0, 1.0), wide]

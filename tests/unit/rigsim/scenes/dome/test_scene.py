@@ -310,6 +310,7 @@ def test_target_stays_in_place(rig, white):
     assert not direct(rig, make_target("dark")).radiance("C", [0]).any()
 
 
+@pytest.mark.long
 def test_vectorized_and_scalar_kernels_agree(rig, face, scene):
     """Two codes of one formula, two ray tracers; float32 against float64, and rays at edges."""
     if not choose_variant("rgb").is_vectorized:

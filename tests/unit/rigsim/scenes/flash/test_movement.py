@@ -50,6 +50,7 @@ def still(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "smile", movement=False)
 
 
+@pytest.mark.long
 def test_moved_face_is_rendered_with_matching_maps(rest, smile):
     before, after = rest.truth(), smile.truth()
     x, y = before["position_mm"][..., 0], before["position_mm"][..., 1]
@@ -61,6 +62,7 @@ def test_moved_face_is_rendered_with_matching_maps(rest, smile):
     assert np.abs(after["uv"] - before["uv"])[still].max() < 0.002
 
 
+@pytest.mark.long
 def test_state_blood_warped_back_matches_blood_at_rest(smile, rig):
     """Rationale: each pixel's skin is known at rest, so the moved map can be laid over the face at
     rest, where it must be the blood of that state.
@@ -87,6 +89,7 @@ def test_state_blood_warped_back_matches_blood_at_rest(smile, rig):
         assert np.median(unmoved[checked]) > 3.0 * np.median(error)
 
 
+@pytest.mark.long
 def test_blood_at_rest_matches_unmoved_face(smile, still):
     truth, unmoved = smile.truth(), still.truth()
     for name in ("hemoglobin", "melanin", "mask"):
@@ -96,6 +99,7 @@ def test_blood_at_rest_matches_unmoved_face(smile, still):
     assert "position_at_rest_mm" not in unmoved
 
 
+@pytest.mark.long
 def test_unchanged_blood_is_laterally_scattered_as_at_rest(rig, face):
     """Rationale: a picture shows blood as light has spread over it, whatever the state, so what a
     state's map at rest is compared with is as smooth as the neutral one. A sharp map less a blurred
@@ -119,6 +123,7 @@ def test_unchanged_blood_is_laterally_scattered_as_at_rest(rig, face):
     assert difference("hemoglobin_blurred_at_rest") < difference("hemoglobin_at_rest") / 3.0
 
 
+@pytest.mark.long
 def test_states_without_movement_change_blood_only_as_reported(rest, smile, still):
     np.testing.assert_array_equal(still.truth()["normals"], rest.truth()["normals"])
     assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
@@ -128,6 +133,7 @@ def test_states_without_movement_change_blood_only_as_reported(rest, smile, stil
     assert smile.needs.builds("shadows of relief")
 
 
+@pytest.mark.long
 def test_global_states_keep_pose_neutral_skips_rest_maps(rest, tired):
     truth = tired.truth()
     np.testing.assert_array_equal(truth["position_mm"], rest.truth()["position_mm"])
@@ -135,6 +141,7 @@ def test_global_states_keep_pose_neutral_skips_rest_maps(rest, tired):
     assert not [name for name in rest.truth() if "at_rest" in name]
 
 
+@pytest.mark.long
 def test_posed_subject_keeps_pose_when_blood_changes(rig, face, tired):
     half = face.with_expression("smile", 0.5)
     scene = scene_of(rig, half, "exercise")
@@ -144,6 +151,7 @@ def test_posed_subject_keeps_pose_when_blood_changes(rig, face, tired):
     )
 
 
+@pytest.mark.long
 def test_truth_at_rest_has_blood_of_pose_amount(rig, face, rest, smile):
     half = scene_of(rig, face.with_expression("smile", 0.5), "smile").truth()
     neutral, full = rest.truth(), smile.truth()
@@ -155,6 +163,7 @@ def test_truth_at_rest_has_blood_of_pose_amount(rig, face, rest, smile):
     assert 0.3 * change(full) < change(half) < 0.75 * change(full)
 
 
+@pytest.mark.long
 def test_scenes_sharing_light_match_scenes_alone(rig, rest, tired):
     beside = tired.radiance()
     stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
@@ -163,6 +172,7 @@ def test_scenes_sharing_light_match_scenes_alone(rig, rest, tired):
     assert (beside != rest.radiance()).any()
 
 
+@pytest.mark.long
 def test_stored_truth_has_landmarks_and_masked_rest_blood(smile, rest):
     truth = build_truth(smile, 4, "0" * 64, "smile")
     assert truth.parameters["state"] == "smile"

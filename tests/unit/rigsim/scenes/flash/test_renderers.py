@@ -51,6 +51,7 @@ def test_renderers_agree_on_a_face(rig, face, state):
         np.testing.assert_allclose(ours[name][inner], theirs[name][inner], atol=3e-4)
 
 
+@pytest.mark.long
 def test_renderers_agree_behind_the_analyzer(rig, face):
     mitsuba, fast = both(rig, face)
     for polarizer in ("parallel", "crossed"):
@@ -61,6 +62,7 @@ def test_renderers_agree_behind_the_analyzer(rig, face):
     assert np.quantile(np.abs(mitsuba.radiance("parallel") - turned), 0.99) > 3e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["white", "chart", "malus"])
 def test_renderers_agree_on_targets(rig, name):
     """Diffuse light, edges of patches, and metal, which keeps polarization."""
@@ -73,6 +75,7 @@ def test_renderers_agree_on_targets(rig, name):
     assert leakier.radiance("crossed").mean() > 1.005 * theirs.mean()
 
 
+@pytest.mark.long
 def test_image_does_not_change_with_its_bands(rig, face, monkeypatch):
     whole, _ = both(rig, face)
     parts, _ = both(rig, face)

@@ -119,6 +119,7 @@ def test_slope_transfer_matches_lens_and_pixel_mtf(lens):
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
+@pytest.mark.long
 def test_ten_micrometers_are_not_resolved(lens):
     """Features of 10 um, waves of 20 um, keep a twentieth; below 15 um nothing is left."""
     assert 17.0 < lens.cutoff_period_um < 19.0

@@ -85,6 +85,7 @@ def test_every_pattern_is_the_sum_of_its_leds(rig, flat_skin):
             np.testing.assert_allclose(got, share * full, rtol=1e-3, atol=1e-4 * full.max())
 
 
+@pytest.mark.long
 def test_a_pattern_and_its_complement_make_full(scene):
     full = scene.radiance("full", grip=NEUTRAL)
     for axis in "xyz":
