@@ -32,7 +32,10 @@ def box_side():
 
 
 class FlippingProxy:
-    """A proxy of a TCP server; it flips a bit of chosen messages, counted over all connections."""
+    """A proxy of a TCP server; it flips a bit of chosen messages, counted over all connections.
+
+    A message begins with the brace of its header; its data may come later, and do not count.
+    """
 
     def __init__(self, port, way, struck):
         self.target, self.way, self.struck = port, way, set(struck)
@@ -74,7 +77,7 @@ class FlippingProxy:
     def pump(self, way, source, sink):
         with contextlib.suppress(OSError):
             while data := source.recv(1 << 16):
-                if way == self.way:
+                if way == self.way and data.startswith(b"{"):
                     self.count += 1
                     if self.count in self.struck:
                         data = bytes([data[0] ^ 1]) + data[1:]
