@@ -165,6 +165,7 @@ def _compare_spectra(
             ),
             "windows": int(count[k]),
             "patch_windows": int(target_count[k]),
+            "patch_rms_um": float(np.sqrt(target[k])),
         }
         for k, (longest, shortest) in enumerate(pairwise(PERIODS_UM))
     ]
@@ -197,7 +198,7 @@ def _draw_windows(
     starts = (texels + 0.5) * side / atlas.size - 0.5 * size
     starts = np.clip(starts.astype(int), 0, side - size)
     scale = 1e3 * atlas.size / side
-    found = []
+    found: list[tuple[Float64Array, tuple[float, float]]] = []
     while len(starts) and len(found) < N_WINDOWS:
         (top, left), texel = starts[0], tuple(texels[0])
         window = np.array(height[top : top + size, left : left + size], np.float64)

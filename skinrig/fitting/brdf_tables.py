@@ -17,6 +17,7 @@ Matusik et al. 2003, doi:10.1145/882262.882343 (square root of theta_h).
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -40,6 +41,8 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.atomic_file import write_atomically
 from skinrig.console import to_json_value
 from skinrig.errors import UnusableError
+
+_log = logging.getLogger(__name__)
 
 OUTPUT_FILES: Final = ("tables.json", "grids.png")
 GRID_NODES: Final = ((8, 4, 2), (16, 8, 4), (32, 16, 8), (90, 32, 12))
@@ -278,9 +281,11 @@ class _GridFits:
                 right = _project(weighted, axes).ravel()
                 scale = normal.diagonal()
                 inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-                kept, _ = sparse.linalg.cg(
+                kept, steps = sparse.linalg.cg(
                     normal, right, rtol=SOLUTION_TOL, M=sparse.diags_array(inverse)
                 )
+                if steps > 0:
+                    _log.warning("fit of a grid: not converged after %d steps", steps)
                 gap = whole - 2.0 * kept @ right + kept @ (normal @ kept)
                 row[k] = np.sqrt(max(gap / whole, 0.0))
         return found.reshape(2, len(GRID_LABELS), len(GRID_NODES))
