@@ -1,5 +1,6 @@
 """`skinrig analyse relief`: steps at seams of charts, and octaves against the patches'."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,15 @@ def test_large_map_counts_if_folder_lists_it(tmp_path, monkeypatch):
     file.unlink()
     with pytest.raises(UnusableError, match="got no such file"):
         analysing._open_map(Path())
+
+
+def test_unknown_octaves_are_null_in_json(moving, tmp_path, rng):
+    mesh = write_sheet(tmp_path / "sheet.npz")
+    write_relief(tmp_path / "relief", rng.standard_normal((64, 64)))
+    measure_relief(tmp_path / "a", tmp_path / "relief", moving=moving, mesh=mesh, seed=0)
+    document = json.loads((tmp_path / "a" / "relief.json").read_text(), parse_constant=pytest.fail)
+    assert document["octaves"][4]["ratio"] is None
+    assert document["octaves"][4]["windows"] == 0
 
 
 def test_map_that_is_not_square_is_refused(tmp_path):
