@@ -37,7 +37,9 @@ LED_RADIUS_RAD = 10.0 / 700.0
 """Angular radius of the dome's lights (10 mm at 700 mm) from its center."""
 RGL_SUFFIX = ".bsdf"
 MATERIAL_SUFFIXES = (".binary", RGL_SUFFIX)
-"""Of files of measured BRDFs: MERL and RGL."""
+"""Suffixes of files of measured BRDFs: MERL and RGL."""
+MIN_MEASURED_COSINE = 0.05
+"""Least cosine of light and view (3 degrees from the horizon) at which measured tables count."""
 _HALF_PI = 0.5 * np.pi
 
 
@@ -173,6 +175,11 @@ def basis_from_columns(
 def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
     """Return a folder's MERL and RGL files by name, in any case; none of a missing folder.
 
+    Raises
+    ------
+    BasisError
+        When two files differ in their suffix alone, so that a material would count twice.
+
     Examples
     --------
     >>> list_material_files("/proc/none")
@@ -180,7 +187,16 @@ def list_material_files(folder: str | os.PathLike[str]) -> list[Path]:
     """
     place = Path(folder)
     found = place.iterdir() if place.is_dir() else []
-    return sorted((p for p in found if p.suffix.lower() in MATERIAL_SUFFIXES), key=lambda p: p.name)
+    files = sorted(p for p in found if p.suffix.lower() in MATERIAL_SUFFIXES)
+    of_stem: dict[str, Path] = {}
+    for file in files:
+        other = of_stem.setdefault(file.stem, file)
+        if other != file:
+            raise BasisError(
+                f"{place}: got {other.name} and {file.name}, expected one file per material; "
+                "remove or rename one"
+            )
+    return files
 
 
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
@@ -216,6 +232,9 @@ def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS
 def read_brdf(path: Path) -> Brdf:
     """Return a MERL or RGL file's BRDF, the mean of its channels; NaN where not measured.
 
+    Light or view within 3 degrees of the horizon count as not measured: values are divided by
+    their cosines, and `tabulate` would fill all nodes below the horizon with the largest.
+
     Raises
     ------
     BasisError
@@ -228,20 +247,26 @@ def read_brdf(path: Path) -> Brdf:
         raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
     if not largest < float(np.finfo(np.float32).max):
         raise BasisError(f"{path}: got {largest:.3g} 1/sr, expected less than 3e38")
-    return brdf
+
+    def measured(light: Float64Array, view: Float64Array) -> Float64Array:
+        known = np.minimum(light[..., 2], view[..., 2]) > MIN_MEASURED_COSINE
+        return np.where(known, brdf(light, view), np.nan)
+
+    return measured
 
 
 def _read_merl(path: Path) -> tuple[Brdf, float]:
     mean = merl.read_mean(path)
-    return merl_brdf(mean), float(np.nanmax(mean, initial=0.0))
+    other = mean[..., ::-1]  # phi_d and pi - phi_d are the same pair: reciprocity, mirror symmetry
+    both = np.where(np.isnan(other), mean, 0.5 * (mean + other))
+    return merl_brdf(np.where(np.isnan(mean), other, both)), float(np.nanmax(mean, initial=0.0))
 
 
 def _read_rgl(path: Path) -> tuple[Brdf, float]:
     table = rgl.read(path)
 
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
-        found = table.evaluate(light, view).mean(axis=-1)
-        return np.where((light[..., 2] > 0.0) & (view[..., 2] > 0.0), found, np.nan)
+        return table.evaluate(light, view).mean(axis=-1)
 
     return brdf, float(np.nanmax(table.values, initial=0.0))
 

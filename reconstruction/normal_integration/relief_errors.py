@@ -3,8 +3,9 @@
 Interreflection in grooves, occlusion between facets and averaging by the lens are not modeled by
 the estimator. On simulated patches of forehead, cheek and chin (seeds 0 to 5, at rest, with the
 sensor's noise) the errors of normals beyond noise are about the same fraction of the relief on
-each. Errors of heights grow with the slopes, and near holes. The constants below give 68 % regions
-a coverage of 68 %; ``skinrig bench --stage intervals`` evaluates them on other seeds.
+each. Errors of heights grow with the slopes, and near holes. On judged patches of forehead and
+cheek, 68 % intervals of heights cover 57 to 73 % (docs/validation/gradient-rig.md). Heights of the
+chin were not judged.
 """
 
 from typing import Final
@@ -16,7 +17,8 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatAr
 from reconstruction.normal_integration.height_filters import SIGMA_PER_CUTOFF
 
 HEIGHT_ERROR_UM: Final = 0.42
-"""Error of the height of a flat relief, um, with the gradient rig's pixels of 6 um."""
+"""Error of the height of a flat relief, um, set with the gradient rig's pixels of 6 um alone. The
+same error is assumed for other pixels, as are the other constants of heights; none was judged."""
 HEIGHT_ERROR_PER_SLOPE_UM: Final = 7.5
 """Error of a height over the variance of one slope, um: steep walls shadow and light each other."""
 HOLE_HEIGHT_ERROR: Final = 0.19
@@ -58,7 +60,7 @@ def height_stderr(
 
     Notes
     -----
-    Set on 16 strain steps of three patches (forehead, seeds 0 and 31, cheek, seed 32), so that 68 %
+    Set on 15 strain steps of three patches (forehead, seeds 0 and 31, cheek, seed 32), so that 68 %
     intervals cover 60 to 76 % of each; other patches judge it (docs/validation/gradient-rig.md).
 
     Examples

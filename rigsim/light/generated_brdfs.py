@@ -28,7 +28,7 @@ TAIL_EXPONENT = (1.2, 3.0)
 def generate_brdf(
     number: int, *, seed: int = 0
 ) -> Callable[[Float64Array, Float64Array], Float64Array]:
-    """Return one BRDF of a set without end.
+    """Return one BRDF of an unlimited set.
 
     Parameters
     ----------

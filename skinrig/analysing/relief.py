@@ -8,18 +8,21 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from model import store
 from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
 from skinrig.appearances import dynamic
+from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.chart_seams import SEAM_ATLAS_PX, SEAM_FADE_MM, ChartSeams, sample_map
 from skinrig.applying.relief import level_site_patch
 from skinrig.arrays import Float64Array
 from skinrig.atomic_file import write_atomically
 from skinrig.blend_shapes import meshes
+from skinrig.console import to_json_value
 from skinrig.errors import UnusableError
 
 OUTPUT_FILE: Final = "relief.json"
@@ -29,7 +32,9 @@ N_WINDOWS: Final = 24
 PERIODS_UM: Final = (2000.0, 1000.0, 500.0, 250.0, 125.0, 62.5)
 """Borders of the judged octaves; 1 mm splits the mesh's own shape from the relief."""
 MIN_PERIODS: Final = 2.0
-"""Longest period of a judged octave over the window's side, inverse."""
+"""Side of a window over the longest period of a judged octave, at least."""
+PERIOD_TOL: Final = 1.01
+"""Factor on a window's longest judged period, for sides of whole pixels."""
 MAX_WINDOW_PX: Final = 1024
 
 
@@ -55,12 +60,14 @@ def measure_relief(
     -------
     dict
         JSON values. ``seam``: steps between both sides, um; ``interior``: differences of
-        neighboring pixels within charts, um; ``octaves``: RMS amplitude over that of the patches.
+        neighboring pixels within charts, um; ``octaves``: RMS amplitude over that of the patches,
+        its standard error over disjoint windows, and their number; NaN for fewer than two.
 
     Raises
     ------
     UnusableError
-        For a folder without this map, or a mesh without texture.
+        For a folder without this map, one whose large map is missing or of another run, a map that
+        is not square, or a mesh without texture.
     """
     appearance, found = dynamic.read(moving, parts=(MICROSTRUCTURE,))
     sites = found.get(MICROSTRUCTURE, {}).get("sites", {})
@@ -84,20 +91,34 @@ def measure_relief(
         for name, site in sites.items()
     ]
     document["octaves"] = _compare_spectra(height, atlas, patches, rng)
-    write_atomically(out / OUTPUT_FILE, json.dumps(document, indent=1))
+    text = json.dumps(to_json_value(document), indent=1, allow_nan=False)
+    write_atomically(out / OUTPUT_FILE, text)
     return document
 
 
 def _open_map(relief: Path) -> Any:
-    large = relief.with_name(f"{relief.name}-large") / f"{MAP_NAME}.npy"
-    if large.exists():
-        return np.load(large, mmap_mode="r")
-    maps = store.read(relief).maps
-    if MAP_NAME not in maps:
+    kept = store.read(relief)
+    if MAP_NAME not in kept.maps:
         raise UnusableError(
             f"{relief}: got no {MAP_NAME}, expected a folder of `skinrig apply microstructure`"
         )
-    return maps[MAP_NAME].values
+    height = kept.maps[MAP_NAME].values
+    figures: Any = kept.parameters.get("figures", {})
+    digest = figures.get(MICROSTRUCTURE, {}).get("files", {}).get(f"{MAP_NAME}.npy")
+    if digest is not None:
+        folder = relief.resolve()
+        large = folder.with_name(f"{folder.name}-large") / f"{MAP_NAME}.npy"
+        if not large.is_file() or hash_file(large) != digest:
+            got = "a file of another run" if large.is_file() else "no such file"
+            raise UnusableError(
+                f"{large}: got {got}, expected the map that {relief} lists; "
+                "repeat `skinrig apply microstructure`"
+            )
+        height = np.load(large, mmap_mode="r")
+    if height.ndim != 2 or height.shape[0] != height.shape[1]:
+        got = " x ".join(str(n) for n in height.shape)
+        raise UnusableError(f"{relief}: {MAP_NAME} has {got} pixels, expected a square map")
+    return height
 
 
 def _measure_seams(height: Any, face: Mesh, rng: np.random.Generator) -> dict[str, Any]:
@@ -130,11 +151,10 @@ def _compare_spectra(
     height: Any, atlas: Atlas, patches: list[tuple[Any, float]], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Return the RMS amplitude of the map's octaves over that of the patches."""
-    target, target_error = _mean_octaves(
+    target, target_error, target_count = _mean_octaves(
         [window for patch, pixel_um in patches for window in _split_patch(patch, pixel_um)]
     )
-    windows = _draw_windows(height, atlas, rng)
-    own, own_error = _mean_octaves(windows)
+    own, own_error, count = _mean_octaves(_draw_windows(height, atlas, rng))
     return [
         {
             "longest_um": longest,
@@ -143,29 +163,30 @@ def _compare_spectra(
             "stderr": float(
                 0.5 * np.sqrt(own[k] / target[k]) * np.hypot(own_error[k], target_error[k])
             ),
-            "windows": len(windows),
+            "windows": int(count[k]),
+            "patch_windows": int(target_count[k]),
+            "patch_rms_um": float(np.sqrt(target[k])),
         }
         for k, (longest, shortest) in enumerate(pairwise(PERIODS_UM))
     ]
 
 
 def _split_patch(patch: Any, pixel_um: float) -> list[tuple[Float64Array, tuple[float, float]]]:
-    """Return nine overlapping windows of a patch, which weigh its parts more evenly than one."""
+    """Return disjoint windows of a patch, as many as its longest judged period permits."""
     known = np.nan_to_num(patch).astype(np.float64)
-    wanted = int(np.ceil(1.02 * MIN_PERIODS * PERIODS_UM[0] / pixel_um))
-    rows, columns = (min(n, max(wanted, n // 2)) for n in known.shape)
-    spare = known.shape[0] - rows, known.shape[1] - columns
+    wanted = int(np.ceil(MIN_PERIODS * PERIODS_UM[0] / PERIOD_TOL / pixel_um))
+    rows, columns = (n // max(n // wanted, 1) for n in known.shape)
     return [
         (known[top : top + rows, left : left + columns], (pixel_um, pixel_um))
-        for top in sorted({part * spare[0] // 2 for part in range(3)})
-        for left in sorted({part * spare[1] // 2 for part in range(3)})
+        for top in range(0, known.shape[0] - rows + 1, rows)
+        for left in range(0, known.shape[1] - columns + 1, columns)
     ]
 
 
 def _draw_windows(
     height: Any, atlas: Atlas, rng: np.random.Generator
 ) -> list[tuple[Float64Array, tuple[float, float]]]:
-    """Return windows of the map within charts and away from seams, with their pixels, um."""
+    """Return disjoint windows within charts and away from seams, with their pixels, um."""
     side = len(height)
     along_u, along_v = atlas.texel_mm()
     texel_um = 1e3 * atlas.typical_texel_mm() * atlas.size / side
@@ -173,27 +194,27 @@ def _draw_windows(
     size = int(min(max(wanted, 64.0), MAX_WINDOW_PX, side))
     margin_mm = 1e-3 * texel_um * size * 0.75 + SEAM_FADE_MM
     inner = ndimage.distance_transform_edt(np.pad(atlas.covered, 1))[1:-1, 1:-1]
-    good = np.argwhere(inner * atlas.typical_texel_mm() > margin_mm)
-    if not len(good):
-        return []
-    found = []
-    for row, column in good[rng.choice(len(good), min(N_WINDOWS, len(good)), replace=False)]:
-        top, left = (
-            int(np.clip((at + 0.5) * side / atlas.size - 0.5 * size, 0, side - size))
-            for at in (row, column)
-        )
+    texels = rng.permutation(np.argwhere(inner * atlas.typical_texel_mm() > margin_mm))
+    starts = (texels + 0.5) * side / atlas.size - 0.5 * size
+    starts = np.clip(starts.astype(int), 0, side - size)
+    scale = 1e3 * atlas.size / side
+    found: list[tuple[Float64Array, tuple[float, float]]] = []
+    while len(starts) and len(found) < N_WINDOWS:
+        (top, left), texel = starts[0], tuple(texels[0])
         window = np.array(height[top : top + size, left : left + size], np.float64)
-        scale = 1e3 * atlas.size / side
-        found.append(
-            (window, (scale * float(along_u[row, column]), scale * float(along_v[row, column])))
-        )
+        found.append((window, (scale * float(along_u[texel]), scale * float(along_v[texel]))))
+        apart = np.abs(starts - starts[0]).max(axis=1) >= size
+        texels, starts = texels[apart], starts[apart]
     return found
 
 
 def _mean_octaves(
     windows: list[tuple[Float64Array, tuple[float, float]]],
-) -> tuple[Float64Array, Float64Array]:
-    """Return the mean variance in each octave, um^2, and its relative standard error; NaN: none."""
+) -> tuple[Float64Array, Float64Array, NDArray[np.intp]]:
+    """Return each octave's mean variance, um^2, its relative standard error, and the windows.
+
+    The error is that of the mean of independent windows; NaN for fewer than two.
+    """
     found = np.full((len(windows), len(PERIODS_UM) - 1), np.nan)
     for row, (window, (pixel_x, pixel_y)) in zip(found, windows, strict=True):
         rows, columns = window.shape
@@ -206,7 +227,7 @@ def _mean_octaves(
         least = np.sqrt(rows * pixel_y * columns * pixel_x) / MIN_PERIODS
         finest = 2.0 * max(pixel_x, pixel_y)
         for k, (longest, shortest) in enumerate(pairwise(PERIODS_UM)):
-            if longest <= least * 1.01 and shortest >= finest:
+            if longest <= least * PERIOD_TOL and shortest >= finest:
                 band = (per_um >= 1.0 / longest) & (per_um < 1.0 / shortest)
                 row[k] = float(power[band].sum())
     count = np.isfinite(found).sum(axis=0)
@@ -214,4 +235,8 @@ def _mean_octaves(
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = known.sum(axis=0) / count
         spread = np.where(np.isfinite(found), (found - mean) ** 2, 0.0).sum(axis=0)
-        return mean, np.sqrt(spread / (count * np.maximum(count - 1, 1))) / mean
+        return (
+            mean,
+            np.sqrt(spread / (count * np.where(count > 1, count - 1, np.nan))) / mean,
+            count,
+        )

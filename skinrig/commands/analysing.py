@@ -329,12 +329,14 @@ def analyse_relief(
     console = Console(json)
     found = measure_relief(out, relief, moving=moving, mesh=mesh, seed=seed)
     console.print_table(
-        ("octave, um", "RMS over the patches'", "standard error", "windows"),
+        ("octave, um", "over patches", "standard error", "windows", "patches, um", "their windows"),
         (
             (
                 f"{row['longest_um']:g} to {row['shortest_um']:g}",
                 *(f"{row[key]:.3f}" for key in ("ratio", "stderr")),
                 row["windows"],
+                f"{row['patch_rms_um']:.3f}",
+                row["patch_windows"],
             )
             for row in found["octaves"]
         ),

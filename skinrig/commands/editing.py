@@ -186,8 +186,9 @@ def fit_brdf(
 ) -> None:
     """Fit measured BRDF tables by formulas and by other tables, and judge grids that store them.
 
-    Errors are relative to the RMS of each BRDF. `skinrig reconstruct --merl-basis` fits sessions
-    with the same folder of tables.
+    Errors are relative to the RMS of each BRDF, those of held-out samples to the RMS of BRDF x
+    cosine of the light. `skinrig reconstruct --merl-basis` fits sessions with the same folder of
+    tables.
 
     Example: skinrig fit brdf merl-tables --out tables
 

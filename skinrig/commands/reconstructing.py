@@ -107,7 +107,9 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 
         most = sum(1 for _ in brdf_recipe.materials())
     else:
-        most = sum(file.suffix.lower() == ".binary" for file in basis.iterdir())
+        from model.brdf.tables import list_material_files
+
+        most = len(list_material_files(basis))
     if rank > most:
         where = "the built-in basis" if basis is None else str(basis)
         raise UnusableError(

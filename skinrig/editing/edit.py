@@ -64,7 +64,7 @@ class EditRequest:
     landmarks
         Table of landmarks, see `face_textures.read`.
     basis
-        Folder of MERL files that the lobes were fitted with.
+        Folder of MERL and RGL files that the lobes were fitted with.
     iterations
         Number of iterations of the albedo matching.
     seed

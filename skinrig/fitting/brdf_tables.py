@@ -1,11 +1,12 @@
 """Fit measured BRDF tables by formulas and by other tables, and judge grids that store them.
 
-Tables are read or generated one at a time. Of each remain its column on the grid of
-:class:`model.brdf.tables.BrdfBasis`, some samples, and errors of projections to coarser grids.
+Tables are read or generated one at a time. Each is reduced to its column on the grid of
+:class:`model.brdf.tables.BrdfBasis`, some samples, and errors of fits by coarser grids.
 
-Errors are relative: RMS of the difference over RMS of the BRDF, where pairs of directions count by
-solid angle, dw_l dw_v = 4 cos(theta_d) dw_h dw_d. Light and view within 3 degrees of the horizon do
-not count: measured tables are unreliable there.
+Errors of whole tables and grids are relative: RMS of the difference over RMS of the BRDF, where
+pairs of directions count by solid angle, dw_l dw_v = 4 cos(theta_d) dw_h dw_d. Light and view
+within 3 degrees of the horizon do not count: measured tables are unreliable there. Errors of
+held-out samples are of BRDF times the light's cosine, as in images; cosines of both exceed 0.1.
 
 References
 ----------
@@ -16,18 +17,21 @@ Matusik et al. 2003, doi:10.1145/882262.882343 (square root of theta_h).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
+from scipy import sparse
 
 from model import merl
 from model.brdf import tables
 from model.brdf.recipe import Brdf
+from model.brdf.tables import MIN_MEASURED_COSINE
 from model.traits.reduced_spaces import mixture_coordinates
 from model.vectors import unit_vectors
 from reconstruction import brdf_basis
@@ -35,7 +39,10 @@ from rigsim.light.generated_brdfs import generate_brdf
 from skinrig.analysing.brdf_space_figures import encode_figure, new_figure
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.atomic_file import write_atomically
+from skinrig.console import to_json_value
 from skinrig.errors import UnusableError
+
+_log = logging.getLogger(__name__)
 
 OUTPUT_FILES: Final = ("tables.json", "grids.png")
 GRID_NODES: Final = ((8, 4, 2), (16, 8, 4), (32, 16, 8), (90, 32, 12))
@@ -51,16 +58,18 @@ N_SAMPLES: Final = 900
 """Samples of a fit, as many as a point of the dome has; as many others are held out."""
 MAX_FITS: Final = 12
 SAMPLE_NOISE: Final = 0.02
-"""Standard error of a sample over its value."""
+"""Standard error of a sample over the sum of its value and the samples' mean."""
 TABLE_NOISE: Final = 0.02
 """Standard error of a generated table's bin over its value."""
-MIN_MEASURED_COSINE: Final = 0.05
-"""Least cosine of light and view in generated tables, and of drawn samples times two."""
+MIN_SAMPLE_COSINE: Final = 0.1
+"""Least cosine of light and view of samples."""
+SOLUTION_TOL: Final = 1e-4
+"""Residual of the least-squares fits of grids over the right side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedTable:
-    """What remains of one table.
+    """Column, samples and grid errors of one table.
 
     Attributes
     ----------
@@ -106,7 +115,8 @@ def generate_table(number: int, *, seed: int = 0) -> Float64Array:
 def tabulate_bins(brdf: Brdf) -> Float64Array:
     """Return a BRDF at the centers of MERL's bins, (90, 90, 180); NaN near the horizon.
 
-    The BRDF of an isotropic surface is the same for phi_d and pi - phi_d: half is evaluated.
+    Half is evaluated: BRDFs of isotropic surfaces are the same for phi_d and pi - phi_d, as are the
+    averaged halves of a MERL file; see `model.brdf.tables.read_brdf`.
     """
     theta_h, theta_d, phi_d = merl.bin_centers()
     half = len(phi_d) // 2
@@ -151,27 +161,34 @@ def fit_tables(
     Raises
     ------
     UnusableError
-        For fewer than three tables.
+        For fewer than three tables, or one without a value above 0 at measured angles.
     model.brdf.tables.BasisError, model.merl.MerlFileError, ...
         For unusable files; see `model.brdf.tables.load`.
     """
     files = None if folder is None else tables.list_material_files(folder)
     total = count if files is None else len(files)
     if total < MIN_TABLES:
-        option = "--tables" if files is None else str(folder)
-        raise UnusableError(
-            f"{option}: got {total} tables, expected {MIN_TABLES} or more; add MERL .binary or "
-            "RGL .bsdf files, or omit the folder"
-        )
+        where, remedy = "--count", "enter more"
+        if folder is not None:
+            where = str(folder)
+            remedy = "add MERL .binary or RGL .bsdf files, or omit the folder"
+        raise UnusableError(f"{where}: got {total}, expected {MIN_TABLES} or more tables; {remedy}")
     report = progress or (lambda text: None)
     rng = np.random.default_rng([seed, 2])
     light, view = (_draw_directions(rng, 2 * N_SAMPLES) for _ in range(2))
-    grids = _GridProjections()
+    grids = _GridFits()
+    node_root = _node_weight_roots()
     reduced: list[ReducedTable] = []
     for name, brdf, table in _each_table(files, total, seed):
         report(f"table {len(reduced) + 1} of {total}: {name}")
         column = tables.tabulate_column(brdf, 0.0)
         samples = np.nan_to_num(brdf(light, view))
+        for part in (np.nan_to_num(table), column * node_root, *np.split(samples, 2)):
+            if not np.any(part > 0.0):
+                raise UnusableError(
+                    f"{name if folder is None else folder / name}: got no value above 0 at angles "
+                    "away from the horizon, expected a material that reflects; remove it"
+                )
         reduced.append(ReducedTable(name, column, samples, grids.errors(table)))
     columns = np.stack([one.column for one in reduced], axis=-1)
     names = [one.name for one in reduced]
@@ -203,7 +220,9 @@ def fit_tables(
         ],
     }
     write_atomically(out / OUTPUT_FILES[1], _draw_grids(document["grids"]))
-    write_atomically(out / OUTPUT_FILES[0], json.dumps(document, indent=1))
+    write_atomically(
+        out / OUTPUT_FILES[0], json.dumps(to_json_value(document), indent=1, allow_nan=False)
+    )
     return document
 
 
@@ -220,18 +239,16 @@ def _each_table(
             yield files[number].name, brdf, tabulate_bins(brdf)
 
 
-class _GridProjections:
-    """Least-squares projections of tables to functions linear between the nodes of coarse grids."""
+class _GridFits:
+    """Least-squares fits of functions linear between the nodes of coarse grids to known bins."""
 
     def __init__(self) -> None:
         h, d, phi = merl.bin_centers()
         edges_h = (np.arange(len(h) + 1) / len(h)) ** 2 * (np.pi / 2)
         edges_d = np.linspace(0.0, np.pi / 2, len(d) + 1)
-        self._roots = tuple(
-            np.sqrt(np.diff(edges)) for edges in (-np.cos(edges_h), np.sin(edges_d) ** 2)
-        )
+        self._solid = np.multiply.outer(np.diff(-np.cos(edges_h)), np.diff(np.sin(edges_d) ** 2))
+        self._known = np.zeros(0, bool)
         folded = np.minimum(phi, np.pi - phi) * (2.0 / np.pi)
-        even = np.ones(len(phi))
         whole_h, whole_d = 2.0 * h / np.pi, 2.0 * d / np.pi
         along = {
             "angles": (whole_h, whole_d),
@@ -239,60 +256,74 @@ class _GridProjections:
             "areas": (1.0 - np.cos(h), np.sin(d) ** 2),
         }
         self._axes = [
-            (
-                _orthonormal_hats(folded, n_phi, even),
-                [
-                    (
-                        _orthonormal_hats(along[grid][0], n_h, self._roots[0]),
-                        _orthonormal_hats(along[grid][1], n_d, self._roots[1]),
-                    )
-                    for grid in GRID_LABELS
-                ],
-            )
+            (_hats(along[grid][0], n_h), _hats(along[grid][1], n_d), _hats(folded, n_phi))
+            for grid in GRID_LABELS
             for n_h, n_d, n_phi in GRID_NODES
         ]
+        self._normals: list[sparse.csr_array] = []
 
     def errors(self, table: Float64Array) -> Float64Array:
-        """Return relative errors (2, grids, sizes) of a table and of its cube root."""
-        filled = _fill_from_inside(table)
-        found = np.empty((2, len(GRID_LABELS), len(GRID_NODES)))
+        """Return relative errors (2, grids, sizes) of a table and of its cube root.
+
+        Bins count by solid angle; unknown ones, NaN, do not count.
+        """
+        known = np.isfinite(table)
+        weight = known * self._solid[..., None]
+        if not np.array_equal(known, self._known):
+            self._known = known
+            self._normals = [_normal_matrix(weight, axes) for axes in self._axes]
+        filled = np.where(known, table, 0.0)
+        found = np.empty((2, len(self._axes)))
         for row, values in zip(found, (filled, np.cbrt(filled)), strict=True):
-            scaled = values * self._roots[0][:, None, None] * self._roots[1][:, None]
-            whole = float(np.sum(scaled**2))
-            for size, (of_phi, others) in enumerate(self._axes):
-                reduced = scaled @ of_phi
-                for place, (of_h, of_d) in enumerate(others):
-                    kept = np.tensordot(of_d, np.tensordot(of_h, reduced, (0, 0)), (0, 1))
-                    row[place, size] = np.sqrt(max(1.0 - float(np.sum(kept**2)) / whole, 0.0))
-        return found
+            weighted = weight * values
+            whole = float(np.sum(weighted * values))
+            for k, (axes, normal) in enumerate(zip(self._axes, self._normals, strict=True)):
+                right = _project(weighted, axes).ravel()
+                scale = normal.diagonal()
+                inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+                kept, steps = sparse.linalg.cg(
+                    normal, right, rtol=SOLUTION_TOL, M=sparse.diags_array(inverse)
+                )
+                if steps > 0:
+                    _log.warning("fit of a grid: not converged after %d steps", steps)
+                gap = whole - 2.0 * kept @ right + kept @ (normal @ kept)
+                row[k] = np.sqrt(max(gap / whole, 0.0))
+        return found.reshape(2, len(GRID_LABELS), len(GRID_NODES))
 
 
-def _orthonormal_hats(at: Float64Array, count: int, root: Float64Array) -> Float64Array:
-    """Return an orthonormal basis of functions linear between `count` even nodes of [0, 1]."""
+def _hats(at: Float64Array, count: int) -> Float64Array:
+    """Return functions linear between `count` even nodes of [0, 1], (bins, count)."""
     distance = np.abs(at[:, None] * (count - 1) - np.arange(count))
-    return np.asarray(scipy.linalg.orth(np.maximum(1.0 - distance, 0.0) * root[:, None]))
+    return np.asarray(np.maximum(1.0 - distance, 0.0))
 
 
-def _fill_from_inside(table: Float64Array) -> Float64Array:
-    """Replace NaN by the last known value towards smaller theta_d, then towards smaller theta_h."""
-    filled = table
-    for axis in (1, 0):
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        place = np.arange(table.shape[axis], dtype=np.int32).reshape(shape)
-        last = np.maximum.accumulate(np.where(np.isfinite(filled), place, 0), axis=axis)
-        filled = np.take_along_axis(filled, last, axis=axis)
-    return np.maximum(np.nan_to_num(filled), 0.0)
+def _project(values: Float64Array, axes: Sequence[Float64Array]) -> Float64Array:
+    """Return the sums over all bins of values (90, 90, 180) times each axis' functions."""
+    along_h, along_d, along_phi = axes
+    return np.asarray(np.tensordot(along_h, along_d.T @ (values @ along_phi), (0, 0)))
+
+
+def _normal_matrix(weight: Float64Array, axes: Sequence[Float64Array]) -> sparse.csr_array:
+    """Return the sums over all bins of weight times products of the grid's functions."""
+    shape = [axis.shape[1] for axis in axes]
+    nodes = np.arange(np.prod(shape)).reshape(shape)
+    rows, columns, values = [], [], []
+    for steps in product((-1, 0, 1), repeat=3):
+        first, second = (
+            [slice(max(s, 0), n + min(s, 0)) for s, n in zip(signs, shape, strict=True)]
+            for signs in ([-step for step in steps], steps)
+        )
+        pairs = [axis[:, a] * axis[:, b] for axis, a, b in zip(axes, first, second, strict=True)]
+        rows.append(nodes[tuple(first)].ravel())
+        columns.append(nodes[tuple(second)].ravel())
+        values.append(_project(weight, pairs).ravel())
+    at = np.concatenate(rows), np.concatenate(columns)
+    return sparse.csr_array((np.concatenate(values), at), shape=(nodes.size,) * 2)
 
 
 def _mixture_errors(columns: Float32Array, formulas: tables.BrdfBasis) -> dict[str, Float64Array]:
     """Return each table's relative distance from mixtures of formulas and of all other tables."""
-    d, phi, h = tables.grid_nodes()
-    at_d, at_phi, at_h = np.meshgrid(d, phi, h, indexing="ij")
-    light, view = merl.to_directions(at_h, at_d, at_phi)
-    known = np.minimum(light[..., 2], view[..., 2]) > MIN_MEASURED_COSINE
-    solid = np.sin(2.0 * at_d) * np.sin(at_h) * np.gradient(h)
-    root = np.sqrt(known * solid)[..., None]
+    root = _node_weight_roots()[..., None]
     rows = _as_rows(columns * root)
     size = np.linalg.norm(rows, axis=1)
     rows /= size[:, None]
@@ -304,6 +335,15 @@ def _mixture_errors(columns: Float32Array, formulas: tables.BrdfBasis) -> dict[s
         weight = mixture_coordinates(rows[k : k + 1], others, None)
         of_tables[k] = np.linalg.norm(rows[k] - weight[0] @ others)
     return {"formulas": np.linalg.norm(rows - weights @ own, axis=1), "tables": of_tables}
+
+
+def _node_weight_roots() -> Float64Array:
+    """Return the roots of the solid angles of the basis' nodes, (32, 12, 90); 0: not measured."""
+    d, phi, h = tables.grid_nodes()
+    at_d, at_phi, at_h = np.meshgrid(d, phi, h, indexing="ij")
+    light, view = merl.to_directions(at_h, at_d, at_phi)
+    known = np.minimum(light[..., 2], view[..., 2]) > MIN_MEASURED_COSINE
+    return np.asarray(np.sqrt(known * np.sin(2.0 * at_d) * np.sin(at_h) * np.gradient(h)))
 
 
 def _as_rows(columns: NDArray[Any]) -> Float64Array:
@@ -350,7 +390,7 @@ def _fit_held_out(
 
 def _draw_directions(rng: np.random.Generator, count: int) -> Float64Array:
     drawn = unit_vectors(rng.standard_normal((8 * count, 3)))
-    return np.ascontiguousarray(drawn[drawn[:, 2] > 2.0 * MIN_MEASURED_COSINE][:count])
+    return np.ascontiguousarray(drawn[drawn[:, 2] > MIN_SAMPLE_COSINE][:count])
 
 
 def _percentiles(errors: Float64Array) -> dict[str, float]:

@@ -96,7 +96,7 @@ def fit_traits(
     size
         Width and height of the common map, pixels; None: those of the coarsest texture.
     basis
-        Folder of MERL files that the lobes were fitted with.
+        Folder of MERL and RGL files that the lobes were fitted with.
     seed
         Random seed of the permutation tests.
     progress

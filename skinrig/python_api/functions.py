@@ -216,7 +216,7 @@ def reconstruct(
     scan
         Face mesh, PLY in mm; None: the session's own scan (dome).
     merl_basis
-        Folder of MERL tables as basis BRDFs; None: the generated ones (dome).
+        Folder of MERL and RGL tables as basis BRDFs; None: the generated ones (dome).
     rank
         Number of basis BRDFs; None: 4 (dome).
     hold_out

@@ -144,7 +144,7 @@ MESH_FILE: Final = "mesh.obj"
 ALBEDO_MAP: Final = "r_d"
 TRANSLUCENCY_MAP: Final = "translucency"
 POSITION_MAP: Final = "position"
-"""Of texels on a mesh: normals beside it are those of the mesh, not of an image."""
+"""Map of points on a mesh, whose normals are not those of an image."""
 CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic", "flash", "probe")
 """Kinds of folders in order of preference for the geometry."""
 PICTURE_KIND: Final = "picture"

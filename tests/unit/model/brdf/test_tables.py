@@ -161,6 +161,21 @@ def test_measured_folder_is_read_in_order_any_spelling(flaws, tmp_path, rng):
     assert basis.evaluate(z, z, z)[2] == pytest.approx(1e5)
 
 
+def test_halves_of_merl_file_are_averaged(tmp_path, rng):
+    values = np.full((90, 90, 180, 1), 0.1)
+    values[:, :, 90:] = 0.3
+    values[:45, :, 90:] = -1.0  # unknown: the other half counts
+    merl.write(tmp_path / "a.binary", merl.MerlTable.from_values(values))
+    brdf = brdf_tables.read_brdf(tmp_path / "a.binary")
+    to, at = directions(rng, 400), directions(rng, 400)
+    to, at = (v[(to[:, 2] > 0.1) & (at[:, 2] > 0.1)] for v in (to, at))
+    theta_h = merl.to_angles(to, at, [0.0, 0.0, 1.0])[0]
+    half_known = merl.bin_indices(theta_h, 0.0 * theta_h, 0.0 * theta_h)
+    expected = np.where(np.array(half_known[0]) < 45, 0.1, 0.2)
+    assert len(set(expected)) == 2
+    np.testing.assert_allclose(brdf(to, at), expected)
+
+
 def test_file_without_light_or_beyond_float32_is_reported(flaws, tmp_path):
     for which, message in (
         ("dark", "no value above 0"),

@@ -1,14 +1,21 @@
 """`skinrig analyse relief`: steps at seams of charts, and octaves against the patches'."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from model import store
 from model.microstructure.kernel_table import FOREHEAD
 from model.skin import SkinAppearance, SkinMap
+from rigsim.geometry.atlas import Atlas
 from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.analysing import relief as analysing
 from skinrig.analysing.relief import measure_relief
 from skinrig.appearances import dynamic
+from skinrig.appearances.contents import hash_file
 from skinrig.applying import relief as applying
 from skinrig.applying.chart_seams import ChartSeams, sample_map
 from skinrig.applying.expression import ExpressionRequest, apply_expression
@@ -75,6 +82,32 @@ def test_bilinear_samples_of_a_plane_are_exact(rng):
     np.testing.assert_allclose(sample_map(plane, uv), 3.0 * uv[:, 0] - 2.0 * uv[:, 1], atol=1e-12)
 
 
+def flat_atlas(side, texel_mm):
+    empty = np.zeros((side, side, 3), np.float32)
+    along_u, along_v = (empty + np.float32(side * texel_mm) * np.eye(3)[k] for k in (0, 1))
+    return Atlas(np.zeros((side, side), np.int32), empty, empty, along_u, along_v)
+
+
+def test_stated_error_of_octaves_is_their_spread(rng):
+    atlas = flat_atlas(256, 0.12)
+    drawn = []
+    for _ in range(40):
+        white = ndimage.gaussian_filter(rng.standard_normal((512, 512)), 1.0, mode="wrap")
+        windows = analysing._draw_windows(white, atlas, rng)
+        drawn.append(analysing._mean_octaves(windows))
+    mean, error, count = (np.array(part)[:, :3] for part in zip(*drawn, strict=True))
+    assert count.min() >= 4
+    spread = mean.std(axis=0, ddof=1) / mean.mean(axis=0)
+    stated = np.sqrt(np.mean(error**2, axis=0))
+    np.testing.assert_allclose(stated, spread, rtol=0.35)
+    places = analysing._draw_windows(np.arange(512.0**2).reshape(512, 512), atlas, rng)
+    pixels = np.concatenate([window.ravel() for window, _ in places])
+    assert len(np.unique(pixels)) == len(pixels)  # windows that overlap have errors too small
+    alone = analysing._mean_octaves(windows[:1])
+    assert np.all(np.isnan(alone[1]))
+    assert alone[2][0] == 1
+
+
 @pytest.mark.long
 def test_map_without_fading_has_steps_at_seams(moving, tmp_path, monkeypatch):
     mesh = write_sheet(tmp_path / "sheet.npz")
@@ -87,6 +120,49 @@ def test_map_without_fading_has_steps_at_seams(moving, tmp_path, monkeypatch):
     for one in joined["octaves"][1:4]:
         assert abs(one["ratio"] - 1.0) < 0.05 + 2.0 * one["stderr"]
         assert one["stderr"] < 0.05
+
+
+def write_relief(folder, kept, large=None):
+    """A folder that lists the large map, if any, in its record."""
+    files = {} if large is None else {f"{analysing.MAP_NAME}.npy": hash_file(large)}
+    figures = {"figures": {dynamic.MICROSTRUCTURE: {"files": files}}}
+    maps = {analysing.MAP_NAME: SkinMap(kept.astype(np.float32), "um")}
+    store.write(folder, SkinAppearance(maps, "measured", figures, {}))
+
+
+def test_large_map_counts_if_folder_lists_it(tmp_path, monkeypatch):
+    small, large = np.zeros((8, 8)), np.ones((16, 16))
+    file = tmp_path / "relief-large" / f"{analysing.MAP_NAME}.npy"
+    file.parent.mkdir()
+    np.save(file, large)
+    write_relief(tmp_path / "relief", small)
+    np.testing.assert_array_equal(analysing._open_map(tmp_path / "relief"), small)
+    write_relief(tmp_path / "relief", small, file)
+    monkeypatch.chdir(tmp_path / "relief")
+    np.testing.assert_array_equal(analysing._open_map(Path()), large)
+    whole = file.read_bytes()
+    for stale in (b"", whole[:-100], whole[:-1] + b"\1"):
+        file.write_bytes(stale)
+        with pytest.raises(UnusableError, match="got a file of another run"):
+            analysing._open_map(Path())
+    file.unlink()
+    with pytest.raises(UnusableError, match="got no such file"):
+        analysing._open_map(Path())
+
+
+def test_unknown_octaves_are_null_in_json(moving, tmp_path, rng):
+    mesh = write_sheet(tmp_path / "sheet.npz")
+    write_relief(tmp_path / "relief", rng.standard_normal((64, 64)))
+    measure_relief(tmp_path / "a", tmp_path / "relief", moving=moving, mesh=mesh, seed=0)
+    document = json.loads((tmp_path / "a" / "relief.json").read_text(), parse_constant=pytest.fail)
+    assert document["octaves"][4]["ratio"] is None
+    assert document["octaves"][4]["windows"] == 0
+
+
+def test_map_that_is_not_square_is_refused(tmp_path):
+    write_relief(tmp_path / "relief", np.zeros((8, 6)))
+    with pytest.raises(UnusableError, match="8 x 6 pixels, expected a square map"):
+        analysing._open_map(tmp_path / "relief")
 
 
 def test_folder_without_relief_is_refused(moving, tmp_path):
