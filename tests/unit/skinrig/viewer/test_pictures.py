@@ -95,7 +95,7 @@ def test_unusable_picture_is_refused_with_reason(tmp_path, maps, options, match)
         faces.build_scene([write(tmp_path / "a", maps)], **options)
 
 
-def test_normals_on_a_mesh_are_not_shown_as_picture(tmp_path):
+def test_normals_of_a_mesh_are_refused(tmp_path):
     maps = {"normals": normals(0.1), "position": SkinMap(np.zeros((*SHAPE, 3), np.float32), "mm")}
     with pytest.raises(SceneError, match="normals of an image"):
         faces.build_scene([write(tmp_path / "a", maps)])
