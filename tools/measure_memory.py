@@ -26,6 +26,8 @@ SIZES: dict[str, dict[str, tuple[Size, ...]]] = {
         "dome": (
             ("--width", "96", "--lights", "48", "--views", "6"),
             ("--width", "640", "--lights", "4", "--views", "2"),
+            ("--width", "1300", "--lights", "4", "--views", "4"),
+            ("--width", "1300", "--lights", "2", "--views", "16"),
         ),
         "gradient": (
             ("--width", "96", "--angles", "0"),
