@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from capture.documents import Document, FaultCollector, InputError
 
@@ -146,6 +147,10 @@ class LedLimits(Document):
         checks.close()
 
 
+HOMING_SPEED_FRACTION: Final = 0.5
+"""Speed of a caliper's jaws on the way to the home mark, of that of other moves."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caliper(Document):
     """Caliper whose jaws are taped to the skin, and stretch or compress the skin between them.
@@ -194,6 +199,22 @@ class Caliper(Document):
         6.4
         """
         return self.aperture_mm + step * self.step_mm
+
+    @property
+    def mean_homing_s(self) -> float:
+        """Mean time to find the home mark at step 0, s, from anywhere in the travel.
+
+        The travel ends half a step beyond the first and the last step.
+
+        Examples
+        --------
+        >>> from capture.rig import load_rig
+        >>> round(load_rig("gradient").caliper.mean_homing_s, 2)
+        2.85
+        """
+        below, above = ((abs(n) + 0.5) * self.step_mm for n in (self.first_step, self.last_step))
+        mean_mm = 0.5 * (below**2 + above**2) / (below + above)
+        return mean_mm / (HOMING_SPEED_FRACTION * self.speed_mm_per_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

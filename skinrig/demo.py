@@ -22,12 +22,12 @@ from typing import Any
 from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
-from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
-from skinrig.errors import EXIT_INTERRUPTED
+from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, choose_width, fuse_person
+from skinrig.errors import EXIT_INTERRUPTED, UnusableError
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
 from skinrig.progress import beat_while_running
-from skinrig.resources.forecast import require_resources_of_tasks
+from skinrig.resources.forecast import measure_folder_mb, require_resources_of_jobs
 from skinrig.simulating.simulation import list_tasks
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
@@ -56,6 +56,8 @@ They lie between those with and without compiled kernels. The flash rig starts f
 in the report while the other rigs run.
 """
 REPORT_NAME = "report.html"
+MARK_NAME = ".skinrig-demo"
+"""File that marks the folder of a demo."""
 RELOAD_S = 10
 """Seconds after which a browser loads a preliminary report again."""
 SecondsByStep = dict[str, float]
@@ -98,11 +100,7 @@ def run_demo(
         raise DemoError(f"seed: got {seed}, expected 0 or more")
     asked = [rig for rig in RIGS if rig in rigs]
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
-    width = {} if width_px is None else {"width_px": width_px}
-    tasks = [
-        task for rig in asked for task in list_tasks(rig, out, **({} if rig == "probe" else width))
-    ]
-    require_resources_of_tasks(tasks, out, processes=at_once, outputs=len(asked), option="")
+    at_once = _require_resources(asked, out, width_px, at_once)
     _make_room(out)
     began = time.perf_counter()
     parts: _Parts = {}
@@ -149,6 +147,23 @@ def run_demo(
         "bench_passed": bench["passed"],
         "report": out / REPORT_NAME,
     }
+
+
+def _require_resources(rigs: Sequence[str], out: Path, width_px: int | None, at_once: int) -> int:
+    """Return how many rigs fit at once, all or one; raise if one does not fit."""
+    jobs = []
+    for rig in rigs:
+        width = choose_width(rig, width_px)
+        jobs.append(list_tasks(rig, out, **({} if width is None else {"width_px": width})))
+    # an earlier demo is removed before work begins
+    held_mb = measure_folder_mb(out) if (out / MARK_NAME).exists() else 0.0
+    require = partial(require_resources_of_jobs, jobs, out, held_mb=held_mb, option="")
+    try:
+        require(processes=at_once)
+    except UnusableError:
+        require(processes=1)
+        return 1
+    return at_once
 
 
 _Order = tuple[Path, int, int | None, Console]
@@ -249,13 +264,24 @@ def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _delayed_signals() -> Iterator[None]:
-    """Deliver Ctrl-C and SIGTERM after the block; processes started in it inherit their delay."""
-    delayed = {signal.SIGINT, signal.SIGTERM}
+    """Deliver Ctrl-C and SIGTERM after the block; processes started in it inherit their delay.
+
+    Another thread of this process may receive them. Python runs their handlers in the main one.
+    """
+    delayed = (signal.SIGINT, signal.SIGTERM)
+    received: list[int] = []
+    handlers: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {one: signal.signal(one, lambda n, _: received.append(n)) for one in delayed}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, delayed)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if received:
+            signal.raise_signal(received[0])
 
 
 def _end_with_parent() -> None:
@@ -295,7 +321,7 @@ def _time_step(name: str, seconds: SecondsByStep, console: Console) -> Iterator[
 
 def _make_room(out: Path) -> None:
     """Empty the folder of an earlier demo; refuse any other folder that is not empty."""
-    mark = out / ".skinrig-demo"
+    mark = out / MARK_NAME
     if out.exists() and not out.is_dir():
         raise DemoError(f"{out}: is a file, expected a folder; name another with --out")
     out.mkdir(parents=True, exist_ok=True)

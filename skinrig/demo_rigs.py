@@ -140,6 +140,21 @@ class RigDemo:
         return folder.name.removeprefix("appearance-"), folder, store.read(folder), truth
 
 
+def choose_width(rig: str, width_px: int | None) -> int | None:
+    """Return the image width of a rig's demo, px; None: that of its small scale.
+
+    Examples
+    --------
+    >>> choose_width("dome", None), choose_width("gradient", 640), choose_width("flash", 640)
+    (320, 256, 640)
+    """
+    if rig == "dome":
+        return DOME_WIDTH_PX if width_px is None else min(width_px, DOME_WIDTH_PX)
+    if rig == "probe" or width_px is None:
+        return None
+    return max(128, min(width_px, 256)) if rig == "gradient" else width_px
+
+
 def _flash(run: RigDemo) -> None:
     """Run the flash rig on targets and a face, up to melanin, blood volume and its changes."""
     found, width = run.found, run.width_px
@@ -191,7 +206,7 @@ def _dome(run: RigDemo) -> None:
     from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 
     found = run.found
-    width = DOME_WIDTH_PX if run.width_px is None else min(run.width_px, DOME_WIDTH_PX)
+    width = choose_width("dome", run.width_px)
     with run.share("dome: capture the calibration targets"):
         for target in ("charuco", "mirror", "white"):
             run.simulate("dome", target, target=target, width_px=width)
@@ -243,7 +258,7 @@ def _gradient(run: RigDemo) -> None:
         for kind in ("lights", "polarization"):
             run.calibrate("gradient", kind, "ball")
     with run.share("gradient: stretch and capture a patch of skin"):
-        width = None if run.width_px is None else max(128, min(run.width_px, 256))
+        width = choose_width("gradient", run.width_px)
         capture = run.simulate("gradient", GRADIENT_SITE, site=GRADIENT_SITE, width_px=width)
     with run.share("gradient: reconstruct normals, heights and kernels"):
         name, folder, maps, truth = run.reconstruct("gradient", capture, GRADIENT_WANT)

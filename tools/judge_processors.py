@@ -21,7 +21,7 @@ import numpy as np
 
 from model import store
 
-AVX512 = "X86_V4 AVX512_ICL"
+AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
 PROCESSORS: Mapping[str, Mapping[str, str]] = {
     "native": {},
     "avx2": {

@@ -22,22 +22,26 @@ from skinrig.resources.forecast import count_megapixels, measure_folder_mb
 Size = tuple[str, ...]
 SIZES: dict[str, dict[str, tuple[Size, ...]]] = {
     "set": {
-        "flash": (("--width", "128"), ("--width", "640"), ("--width", "128", "--repeats", "4")),
+        "flash": (("--width", "128"), ("--width", "960"), ("--width", "128", "--repeats", "4")),
         "dome": (
-            ("--width", "96", "--lights", "16", "--views", "4"),
-            ("--width", "640", "--lights", "4", "--views", "2"),
             ("--width", "96", "--lights", "48", "--views", "6"),
+            ("--width", "640", "--lights", "4", "--views", "2"),
+            ("--width", "1300", "--lights", "4", "--views", "4"),
+            ("--width", "1300", "--lights", "2", "--views", "16"),
         ),
         "gradient": (
             ("--width", "96", "--angles", "0"),
+            ("--width", "224", "--angles", "0", "--steps", "0..0"),
             ("--width", "512", "--angles", "0", "--steps", "0..0"),
-            ("--width", "96", "--angles", "0,60,120"),
         ),
         "probe": (("--sites", "cheek"), ("--sites", "cheek", "--repeats", "4")),
     },
     "judged": {
-        "flash": (("--width", "960"),),
-        "dome": (("--width", "320", "--lights", "12", "--views", "3"),),
+        "flash": (("--width", "384"), ("--width", "640")),
+        "dome": (
+            ("--width", "224", "--lights", "16", "--views", "4"),
+            ("--width", "320", "--lights", "12", "--views", "3"),
+        ),
         "gradient": (("--width", "320", "--angles", "0", "--steps", "0..1"),),
         "probe": (("--sites", "cheek,forehead", "--repeats", "2"),),
     },

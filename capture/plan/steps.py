@@ -204,11 +204,12 @@ class Plan(Document):
         checks.close()
 
     def estimate_duration_s(self, rig: Rig) -> float:
-        """Return the minimum duration of the plan on ``rig``, s.
+        """Return the duration of the plan on ``rig``, s, without talk on the lines.
 
         Per step the slowest camera's exposure and readout, or the recycling of the flash or the
         duration of the light when that is longer, and the turning of the analyzer when its state
-        changes. When a caliper's position changes its travel, and the time of the skin's creep;
+        changes. When a caliper's position changes its travel, and the time of the skin's creep; the
+        mean time of its homing, as the jaws' place before is not known;
         when a head is held by suction, pumping and rests, and all exposures of a series, though
         some may turn out to be unnecessary. For a sequence its lead and its last time. The time of
         a person who tapes the caliper or places the head is not included.
@@ -217,6 +218,8 @@ class Plan(Document):
         each_s: list[float] = []
         state: object = None
         held: tuple[object, int] = (None, 0)
+        if rig.caliper is not None and any("caliper" in step.index for step in self.steps):
+            total += rig.caliper.mean_homing_s
         for step in self.steps:
             readout_s = max(rig.view(name).readout_s for name in step.cameras)
             power = float(step.settings.get("power", 0.0))

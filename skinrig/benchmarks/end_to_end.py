@@ -62,7 +62,7 @@ CASES: Final[Mapping[str, EndToEndCase]] = {
     "flash": EndToEndCase(
         tuple(zip(PRESET_NAMES, range(621, 627), strict=True)), {256: (30.0, 45.0, 90.0)}
     ),
-    "gradient": EndToEndCase((("II", 742), ("V", 743)), {128: (21.95, 22.1, 30.0)}),
+    "gradient": EndToEndCase((("II", 742), ("V", 743)), {128: (24.8, 24.95, 32.8)}),
     "probe": EndToEndCase(
         (("II", 722), ("IV", 723), ("V", 724)), {None: (55.0, 90.0, 160.0)}, by_coverage=True
     ),

@@ -16,7 +16,6 @@ from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
 from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error, require_choice
-from skinrig.resources.forecast import forecast_resources, require_resources
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function by stage. A module is imported, and its kernels are compiled, when the stage
@@ -86,8 +85,6 @@ def run_stages(
     for name in chosen:
         require_choice("stage", name, STAGES, BenchError)
     small = toy or not names
-    need = forecast_resources("bench small" if small else "bench full", {})
-    require_resources("bench", need, out or Path())
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
     run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)

@@ -97,7 +97,10 @@ def bench(
         document = run_extremes(stages or (), out=out, console=console)
     else:
         from skinrig.benchmarks.stages import run_stages
+        from skinrig.resources.forecast import forecast_resources, require_resources
 
+        need = forecast_resources("bench small" if smoke else "bench full", {})
+        require_resources("bench", need, out or Path())
         document = run_stages(
             stages, budget_s=budget, toy=smoke, out=out, console=console, selection=end_to_end
         )

@@ -28,7 +28,7 @@ CROSSTALK_ERROR = (8.6e-6, 6.3e-6, 1.03e-6, 7.6e-7, 3.6e-7, 2.2e-7, 2.9e-7, 6.0e
 """Standard uncertainty of cross-talk by group of distances, see
 `capture.calibration.fiber.crosstalk.DISTANCE_EDGES`.
 
-Cross-talk is the fraction of a fiber's light in another spot. Medians of four simulated
+Cross-talk is the fraction of a fiber's light in another spot. Medians of two simulated
 calibrations of the shipped rig, seeds 9200 and 9201.
 """
 STRAY_LIGHT_ERROR_PER_MM2 = (1.6e-9, 9.7e-10, 1.8e-9)

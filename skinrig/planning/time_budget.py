@@ -3,7 +3,7 @@
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
@@ -167,7 +167,18 @@ def choose_within_budget(
         {"total_s": one.run_times["total"], "capture_s": one.seconds, **one.medians}
         for one in sorted(choices, key=lambda one: one.run_times["total"])
     )
-    return replace(best, path=path)
+    return replace(best, path=path, reasons=(*best.reasons, *_list_assumptions(best.rig)))
+
+
+def _list_assumptions(rig: Rig) -> Iterator[str]:
+    """Yield what the forecast of a rig's seconds assumes."""
+    width_px = rig.views[0].width_px
+    set_px = _read_run_times()[rig.name].get("set_width_px", width_px)
+    if not 0.5 * set_px <= width_px <= 2.0 * set_px:
+        yield (
+            f"seconds of calibration and reconstruction were set on images {set_px} pixels wide; "
+            f"those at {width_px} pixels are an assumption"
+        )
 
 
 def select_best(choices: Sequence[PlanChoice], min_valid_fraction: float) -> PlanChoice:
@@ -207,9 +218,10 @@ def list_choices_within_budget(
         for one in generate_choices(rig, request, is_affordable)
     ]
     if not choices:
+        narrower = "" if rig.name == "probe" else " or lower --width"
         raise PlanningError(
             f"--budget: got {budget_s:g} s, expected at least {math.ceil(min(totals_s))} s for the "
-            f"quickest plan of the {rig.name} rig and its maps; raise it or lower --width"
+            f"quickest plan of the {rig.name} rig and its maps; raise it{narrower}"
         )
     return choices
 

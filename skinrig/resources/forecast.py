@@ -7,7 +7,7 @@ coefficients in `data/memory.toml` are set on.
 import math
 import shutil
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -29,17 +29,17 @@ of all frames; "source_mb", bytes of the folder to be exported."""
 
 @dataclass(frozen=True, slots=True)
 class ResourceForecast:
-    """Forecast peaks of one process, MB."""
+    """Forecast peaks, MB."""
 
     memory_mb: float
-    """Peak resident memory."""
+    """Peak resident memory of all processes."""
     space_mb: float
-    """Peak address space, which `ulimit -v` limits."""
+    """Peak address space of one process, which `ulimit -v` limits."""
     disk_mb: float
     """Files of the output."""
 
     def fits(self, free: FreeMemory) -> bool:
-        """Return whether the memory of a process is below what it can have.
+        """Return whether memory and address space are below what is free.
 
         Examples
         --------
@@ -71,9 +71,7 @@ def count_megapixels(rig: Rig, plan: Plan) -> Amounts:
     }
 
 
-def forecast_resources(
-    work: str, amounts: Amounts, *, processes: int = 1, outputs: int = 1
-) -> ResourceForecast:
+def forecast_resources(work: str, amounts: Amounts) -> ResourceForecast:
     """Forecast memory and disk of a command.
 
     Parameters
@@ -81,31 +79,25 @@ def forecast_resources(
     work
         Command, and rig where the command depends on it, such as "simulate flash".
     amounts
-        Sizes of one process's work.
-    processes
-        Processes that do such work at once.
-    outputs
-        Such outputs that are written.
+        Sizes of its work.
 
     Examples
     --------
-    >>> one, two = (forecast_resources("simulate probe", {}, processes=n) for n in (1, 2))
-    >>> two.memory_mb == 2.0 * one.memory_mb > 0.0
-    True
+    >>> forecast_resources("reconstruct flash", {"camera_mp": 1.0}).memory_mb
+    475.0
     """
     row: Mapping[str, Any] = _read_table()
     for word in work.split():
         row = row[word]
     memory_mb, disk_mb = (
         one["fixed"]
-        + min(
-            sum(number * one.get(name, 0.0) for name, number in amounts.items()),
-            one.get("growth_limit", math.inf),
+        + sum(
+            min(number * one.get(name, 0.0), one.get("most", {}).get(name, math.inf))
+            for name, number in amounts.items()
         )
         for one in (row["memory_mb"], row["disk_mb"])
     )
-    space_mb = memory_mb + row["space_above_memory_mb"]
-    return ResourceForecast(memory_mb * processes, space_mb, disk_mb * outputs)
+    return ResourceForecast(memory_mb, memory_mb + row["space_above_memory_mb"], disk_mb)
 
 
 def forecast_smaller_widths(
@@ -198,26 +190,33 @@ class Task:
     amounts: Amounts
 
 
-def require_resources_of_tasks(
-    tasks: Iterable[Task],
+Job = Sequence[Task]
+"""Tasks that one process does one after the other."""
+
+
+def require_resources_of_jobs(
+    jobs: Iterable[Job],
     out: Path,
     *,
     processes: int,
-    outputs: int,
+    outputs: int | None = None,
+    held_mb: float = 0.0,
     option: str = "--executor local:",
 ) -> None:
-    """Raise unless memory and disk suffice for the largest of some tasks in each process.
+    """Raise unless memory suffices for the largest jobs at once, and disk for their outputs.
 
     Parameters
     ----------
-    tasks
-        Tasks; without any nothing is required.
+    jobs
+        Jobs, each with at least one task; without any nothing is required.
     out
         Output, whose disk is tried.
     processes
-        Processes of this machine that do the tasks; 0: those of other machines do.
+        Processes of this machine that do the jobs; 0: those of other machines do.
     outputs
-        Outputs that are on the disk at once.
+        Jobs whose outputs are on the disk at once, the largest; None: all.
+    held_mb
+        Files of the output that are there already, or are removed first.
     option
         Option that sets the number of processes, without the number; empty: there is none.
 
@@ -226,20 +225,22 @@ def require_resources_of_tasks(
     skinrig.errors.UnusableError
         With what is needed, what is free, and what to do.
     """
-    largest = max(
-        tasks, key=lambda task: forecast_resources(task.work, task.amounts).memory_mb, default=None
-    )
-    if largest is None or processes == 0:
+    tasks = [[(forecast_resources(one.work, one.amounts), one.work) for one in job] for job in jobs]
+    if not tasks or processes == 0:
         return
-
-    def forecast(count: int) -> ResourceForecast:
-        work, amounts = largest.work, largest.amounts
-        return forecast_resources(work, amounts, processes=count, outputs=outputs)
-
-    fewer = range(processes - 1, 0, -1) if option else ()
-    smaller = {f"{option}{n}": forecast(n) for n in fewer}
-    many = f" in {processes} processes" if processes > 1 else ""
-    require_resources(largest.work + many, forecast(processes), out, smaller=smaller)
+    memory_mb = sorted((max(need.memory_mb for need, _ in job) for job in tasks), reverse=True)
+    disk_mb = sorted((sum(need.disk_mb for need, _ in job) for job in tasks), reverse=True)
+    largest, work = max((one for job in tasks for one in job), key=lambda one: one[0].memory_mb)
+    forecasts = {
+        count: ResourceForecast(
+            sum(memory_mb[:count]), largest.space_mb, sum(disk_mb[:outputs]) - held_mb
+        )
+        for count in range(min(processes, len(tasks)), 0, -1)
+    }
+    count, need = next(iter(forecasts.items()))
+    smaller = {f"{option}{n}": one for n, one in forecasts.items() if option and n < count}
+    many = f" in {count} processes" if count > 1 else ""
+    require_resources(work + many, need, out, smaller=smaller)
 
 
 def _advise_smaller(smaller: Mapping[str, ResourceForecast], free: FreeMemory) -> str:

@@ -93,10 +93,10 @@ def _read_group_mb(process: Path, groups: Path) -> float:
     for line in lines:
         number, controllers, name = [*line.split(":", 2), "", ""][:3]
         if number == "0" and not controllers:
-            root, names = groups, ("memory.max", "memory.current", "inactive_file")
+            root, names = groups, ("memory.max", "memory.current", "")
         elif "memory" in controllers.split(","):
             root = groups / "memory"
-            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")
         else:
             continue
         own = PurePosixPath(name.lstrip("/"))
@@ -105,15 +105,16 @@ def _read_group_mb(process: Path, groups: Path) -> float:
     return free_mb
 
 
-def _read_group_folder_mb(folder: Path, limit: str, usage: str, cached: str) -> float:
+def _read_group_folder_mb(folder: Path, limit: str, usage: str, prefix: str) -> float:
     """Return limit less usage of one group, MB; pages of files that can be dropped are free."""
     try:
         limit_bytes = int((folder / limit).read_text("ascii"))
         used_bytes = int((folder / usage).read_text("ascii"))
-        rows = (folder / "memory.stat").read_text("ascii").splitlines()
-    except (OSError, ValueError):  # no such group, or "max"
+        rows = [line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines()]
+        dropped = {f"{prefix}active_file", f"{prefix}inactive_file"}
+        used_bytes -= sum(int(row[1]) for row in rows if row[0] in dropped)
+    except (OSError, ValueError, IndexError):  # no such group, "max", or another format
         return math.inf
     if limit_bytes >= NO_LIMIT_BYTES:
         return math.inf
-    dropped = sum(int(row.split()[1]) for row in rows if row.split()[0] == cached)
-    return max(limit_bytes - max(used_bytes - dropped, 0), 0) * 1e-6
+    return max(limit_bytes - max(used_bytes, 0), 0) * 1e-6

@@ -3,7 +3,7 @@
 import io
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +14,7 @@ from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, SubjectRecord, resume_unless_complete
+from capture.session import Session, SessionError, SubjectRecord, resume_unless_complete
 from model import store
 from model.skin import SkinAppearance
 from rigsim.world import World
@@ -25,6 +25,7 @@ from skinrig.resources.forecast import (
     count_megapixels,
     forecast_resources,
     forecast_smaller_widths,
+    measure_folder_mb,
     require_resources,
 )
 from skinrig.simulating import subject_records
@@ -166,15 +167,26 @@ def open_session(
 
 
 def require_room(order: SimulationOrder, rig: Rig, plan: Plan) -> None:
-    """Raise unless memory and disk suffice for a simulation; voxels of skin are not forecast."""
+    """Raise unless memory and disk suffice for what a simulation lacks.
+
+    Voxels of skin are not forecast. A resumed session that has all frames needs no more.
+    """
     if order.renderer != "mitsuba":
         return
+    held_mb = 0.0
+    if order.resume:
+        with suppress(SessionError):  # a session that cannot be read is refused on resuming
+            if Session.open(order.out).complete:
+                return
+        held_mb = measure_folder_mb(order.out)
     work = f"simulate {order.rig}"
     amounts = count_megapixels(rig, plan)
     smaller = {}
-    if hasattr(order, "width_px"):
+    if hasattr(order, "width_px") and not order.resume:
         smaller = forecast_smaller_widths(work, rig.views[0].width_px, amounts)
-    require_resources(work, forecast_resources(work, amounts), order.out, smaller=smaller)
+    need = forecast_resources(work, amounts)
+    need = replace(need, disk_mb=need.disk_mb - held_mb)
+    require_resources(work, need, order.out, smaller=smaller)
 
 
 def announce_light(plan: Plan, rig: Rig, order: SimulationOrder) -> Mapping[str, float | str]:

@@ -8,11 +8,18 @@ from pathlib import Path
 
 from capture.plan.rig_kinds import find_rig_kind
 from capture.session import Session, SessionError
+from model import store
 from reconstruction.pipeline import recipes
-from reconstruction.pipeline.inputs import DomeOptions
+from reconstruction.pipeline.checkpoints import work_folder
+from reconstruction.pipeline.inputs import DomeOptions, InputsError
 from reconstruction.tiles import map_tiles
 from skinrig.errors import UnusableError
-from skinrig.resources.forecast import Task, count_megapixels, require_resources_of_tasks
+from skinrig.resources.forecast import (
+    Task,
+    count_megapixels,
+    measure_folder_mb,
+    require_resources_of_jobs,
+)
 from skinrig.studies.description import require_software, software_hash
 from skinrig.studies.executors import (
     ExecutorLost,
@@ -98,19 +105,32 @@ def _reconstruct_on_worker(order: ReconstructionOrder, software: str) -> Reconst
 def _require_room(orders: Sequence[ReconstructionOrder], executor: str) -> None:
     """Raise unless memory and disk suffice; images under lights of a list are not forecast.
 
-    A session that cannot be read here is refused when its own turn comes.
+    A session that cannot be read here is refused when its own turn comes. One whose maps are there
+    needs nothing, unless an option has changed.
     """
-    tasks = []
+    jobs, held_mb = [], 0.0
     for order in orders:
         try:
             session = Session.open(order.session)
         except SessionError:
             continue
-        if "light_list" not in session.manifest.extra:
+        if "light_list" not in session.manifest.extra and not _has_maps(order, session):
             work = f"reconstruct {find_rig_kind(session.rig)}"
-            tasks.append(Task(work, count_megapixels(session.rig, session.plan)))
+            jobs.append([Task(work, count_megapixels(session.rig, session.plan))])
+            held_mb += measure_folder_mb(order.out) + measure_folder_mb(work_folder(order.out))
     processes = count_local_processes(executor)
-    require_resources_of_tasks(tasks, orders[0].out, processes=processes, outputs=len(tasks))
+    require_resources_of_jobs(jobs, orders[0].out, processes=processes, held_mb=held_mb)
+
+
+def _has_maps(order: ReconstructionOrder, session: Session) -> bool:
+    """Return whether an output has all wanted maps of the content of a session."""
+    try:
+        found = store.read_document(order.out)
+        want = recipes.recipe_for_session(session).expand(session, order.want)
+    except (store.StoreError, InputsError):
+        return False
+    named = {*found.maps, *found.files, *(name for name, _ in found.left_out)}
+    return found.inputs.get("session") == session.content_hash and named.issuperset(want)
 
 
 def reconstruct_sessions(

@@ -3,13 +3,13 @@
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from skinrig.resources.forecast import Task, require_resources_of_tasks
+from skinrig.resources.forecast import Task, require_resources_of_jobs
 from skinrig.simulating.simulation import list_tasks
 from skinrig.studies import results
 from skinrig.studies.cases import (
@@ -22,7 +22,7 @@ from skinrig.studies.cases import (
     read_record,
     run_case,
 )
-from skinrig.studies.description import Case, StudyError, StudyFile, software_hash
+from skinrig.studies.description import Case, CaseSize, StudyError, StudyFile, software_hash
 from skinrig.studies.executors import (
     SERIAL_EXECUTOR,
     ExecutorLost,
@@ -87,7 +87,6 @@ def run_study(
     cases = {case.key(software): case for case in study.list_cases()}
     out = out.absolute()
     with _lock(out):
-        _require_room(cases.values(), executor, out)
         done = {key: found for key in cases if (found := read_record(out, key)) is not None}
         one_thread = executor != SERIAL_EXECUTOR
         orders = [
@@ -95,6 +94,7 @@ def run_study(
             for key, case in cases.items()
             if key not in done
         ]
+        _require_room(orders, executor, out)
         if done:
             progress(f"{len(done)} of {len(cases)} cases are complete already")
         errors: dict[str, str] = {}
@@ -129,14 +129,21 @@ def run_study(
     return run
 
 
-def _require_room(cases: Iterable[Case], executor: str, out: Path) -> None:
-    """Raise unless memory and disk suffice for the largest of the cases."""
-    tasks: list[Task] = []
-    for rig, size in dict.fromkeys((case.rig, case.size) for case in cases):
-        given = {name: n for name, n in asdict(size).items() if n is not None}
-        tasks += list_tasks(rig, out, **given)
+def _require_room(orders: Sequence[CaseOrder], executor: str, out: Path) -> None:
+    """Raise unless memory and disk suffice for the largest cases at once, on disk for all kept."""
+    jobs: dict[tuple[str, CaseSize], list[Task]] = {}
+    for order in orders:
+        rig, size = order.case.rig, order.case.size
+        if (rig, size) not in jobs:
+            given = {name: n for name, n in asdict(size).items() if n is not None}
+            jobs[rig, size] = list_tasks(rig, out, **given)
     processes = count_local_processes(executor)
-    require_resources_of_tasks(tasks, out, processes=processes, outputs=processes)
+    require_resources_of_jobs(
+        [jobs[order.case.rig, order.case.size] for order in orders],
+        out,
+        processes=processes,
+        outputs=None if any(order.keep for order in orders) else processes,
+    )
 
 
 def _run_orders(orders: Sequence[CaseOrder], executor: str) -> Iterator[CaseOutcome]:

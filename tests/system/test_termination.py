@@ -4,12 +4,13 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from skinrig import errors
+from skinrig import demo, errors
 
 TIMEOUT_S = 120.0
 
@@ -101,6 +102,28 @@ def test_ended_demo_leaves_no_process(ending, tmp_path):
     assert not [pid for pid in children if is_alive(pid)]
     if ending != "killed":
         assert list(temporary.iterdir()) == []
+
+
+def test_signal_to_other_thread_waits_for_block():
+    """A thread that does not block signals receives them for the process."""
+    lines, ended = [], threading.Event()
+    thread = threading.Thread(target=ended.wait)
+    thread.start()
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt():
+        with demo._delayed_signals():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            lines.append("end of the block")
+        lines.append("the signal was lost")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
+    ended.set()
+    thread.join()
+    assert lines == ["end of the block"]
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_lack_of_memory_is_not_a_defect():

@@ -1,5 +1,7 @@
 """Work that needs more memory or disk than is free is refused before it begins."""
 
+import functools
+import itertools
 import math
 import os
 import resource
@@ -10,18 +12,25 @@ from collections import namedtuple
 from types import SimpleNamespace
 
 import pytest
+from fixtures.study_judge import judge_by_drawing
 
 from capture.plan.dome import dome_plan
 from capture.rig import load_rig
+from capture.session import Session
+from model import store
+from model.skin import SkinAppearance
 from reconstruction.pipeline.inputs import DomeOptions
+from skinrig import demo
 from skinrig.cli import main
 from skinrig.errors import EXIT_BAD_INPUT, UnusableError
 from skinrig.resources import forecast as resources
 from skinrig.resources.forecast import ResourceForecast
 from skinrig.resources.free_memory import FreeMemory, read_free_memory
-from skinrig.studies import reconstruction, study
-from skinrig.studies.description import CaseSize
+from skinrig.simulating.simulation import simulate_session
+from skinrig.studies import reconstruction
+from skinrig.studies.description import CaseGroup, CaseSize, StudyFile
 from skinrig.studies.reconstruction import ReconstructionOrder
+from skinrig.studies.study import run_study
 
 Usage = namedtuple("Usage", "total used free")
 LIMIT_BYTES = 2 * 10**9
@@ -46,7 +55,8 @@ def limit_group(folder, names, limit, used, dropped):
     for name, number in zip(names, (limit, used), strict=True):
         (folder / name).write_text(f"{number}\n")
     (folder / "memory.stat").write_text(
-        f"anon 5\ninactive_file {dropped}\ntotal_inactive_file {dropped}\n"
+        f"anon 5\nactive_file {dropped // 4}\ninactive_file {dropped - dropped // 4}\n"
+        f"total_active_file {dropped // 4}\ntotal_inactive_file {dropped - dropped // 4}\n"
     )
 
 
@@ -79,6 +89,15 @@ def test_group_without_limit_limits_nothing(kernel, limit):
     (process / "self/cgroup").write_text("0::/job\n")
     limit_group(groups / "job", VERSION_2, limit, 10**9, 0)
     assert read_free_memory(process, groups).source == "machine"
+
+
+@pytest.mark.parametrize("text", ["", "anon 5\n\n", "inactive_file\n", "active_file x\n"])
+def test_unknown_statistics_raise_nothing(kernel, text):
+    process, groups = kernel
+    (process / "self/cgroup").write_text("0::/job\n")
+    limit_group(groups / "job", VERSION_2, 10**9, 10**8, 0)
+    (groups / "job/memory.stat").write_text(text)
+    assert read_free_memory(process, groups).source == ("machine" if text else "control group")
 
 
 def test_variable_replaces_free_memory(monkeypatch):
@@ -159,13 +178,27 @@ def test_lack_of_disk_is_refused(free, tmp_path, monkeypatch):
 
 
 def test_fewer_processes_are_advised(free, tmp_path):
-    tasks = [resources.Task("reconstruct flash", {"camera_mp": n}) for n in (0.1, 10.0)]
-    one = resources.forecast_resources(tasks[1].work, tasks[1].amounts)
-    free(2.5 * one.memory_mb)
+    jobs = [[resources.Task("reconstruct flash", {"camera_mp": n})] for n in (0.1, 10.0, 9.9)]
+    one = resources.forecast_resources("reconstruct flash", {"camera_mp": 10.0})
+    free(2.1 * one.memory_mb)
     with pytest.raises(UnusableError, match="--executor local:2 needs"):
-        resources.require_resources_of_tasks(tasks, tmp_path, processes=4, outputs=2)
-    resources.require_resources_of_tasks(tasks, tmp_path, processes=2, outputs=2)
-    resources.require_resources_of_tasks(tasks, tmp_path, processes=0, outputs=2)
+        resources.require_resources_of_jobs(jobs, tmp_path, processes=4)
+    resources.require_resources_of_jobs(jobs, tmp_path, processes=2)
+    resources.require_resources_of_jobs(jobs, tmp_path, processes=0)
+    resources.require_resources_of_jobs(jobs[:2], tmp_path, processes=4)
+
+
+def test_disk_is_that_of_outputs(free, tmp_path, monkeypatch):
+    """An output of 1.1 GB and eleven of 11 MB fit into 1.5 GB, two large ones do not."""
+    free(math.inf)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(9, 9, 1_500_000_000))
+    small = [resources.Task("reconstruct flash", {"camera_mp": 1.0})]
+    jobs = [[resources.Task("reconstruct flash", {"camera_mp": 100.0})], *[small] * 11]
+    resources.require_resources_of_jobs(jobs, tmp_path, processes=1)
+    with pytest.raises(UnusableError, match=r"writes about 2\.3 GB"):
+        resources.require_resources_of_jobs([jobs[0], *jobs], tmp_path, processes=1)
+    resources.require_resources_of_jobs([jobs[0], *jobs], tmp_path, processes=1, outputs=1)
+    resources.require_resources_of_jobs([jobs[0], *jobs], tmp_path, processes=1, held_mb=1000.0)
 
 
 def test_export_without_memory_is_refused_first(tmp_path, free, capsys):
@@ -174,20 +207,56 @@ def test_export_without_memory_is_refused_first(tmp_path, free, capsys):
     assert "export --to maps needs about" in capsys.readouterr().err
 
 
-def test_full_dome_needs_no_more_than_files_keep():
-    """Samples above 1 GiB go to files: 5,000 frames need hardly more memory than 300."""
-    few, many = (
-        resources.forecast_resources("reconstruct dome", {"frame_mp": frames * 1.34})
-        for frames in (300, 5000)
+@pytest.mark.parametrize(
+    ("work", "few", "many", "memory_mb"),
+    [
+        ("reconstruct dome", {"frame_mp": 400.0}, {"frame_mp": 6700.0}, 3080.0),
+        ("simulate dome", {"frame_mp": 400.0}, {"frame_mp": 6700.0}, 650.0),
+        ("simulate flash", {"frame_mp": 1.0}, {"frame_mp": 100.0}, 493.0),
+        ("simulate gradient", {"frame_mp": 60.0}, {"frame_mp": 3498.0}, 913.0),
+    ],
+)
+def test_bounded_caches_bound_forecasts(work, few, many, memory_mb):
+    first, second = (resources.forecast_resources(work, amounts) for amounts in (few, many))
+    assert first.memory_mb == second.memory_mb == pytest.approx(memory_mb)
+    assert second.disk_mb > 1.5 * first.disk_mb
+
+
+def test_bound_of_frames_leaves_cameras():
+    one, two = (
+        resources.forecast_resources("simulate gradient", {"camera_mp": n, "frame_mp": 3498.0})
+        for n in (1.0, 2.0)
     )
-    assert many.memory_mb == pytest.approx(3080.0)
-    assert many.memory_mb == few.memory_mb
-    assert many.disk_mb > 10 * few.disk_mb
+    assert two.memory_mb == pytest.approx(one.memory_mb + 859.0)
+
+
+def test_demo_falls_back_to_one_process(tmp_path, free):
+    """The width of the dome's demo is bounded, and so is its forecast."""
+    out = tmp_path / "demo"
+    free(math.inf)
+    assert demo._require_resources(["dome", "probe"], out, None, 2) == 2
+    free(1500.0)
+    assert demo._require_resources(["dome", "probe"], out, 4000, 2) == 1
+    free(1000.0)
+    with pytest.raises(UnusableError, match="reconstruct dome needs about"):
+        demo._require_resources(["dome", "probe"], out, None, 2)
+
+
+def test_earlier_demo_leaves_its_disk(tmp_path, free, monkeypatch):
+    free(math.inf)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(9, 9, 10_000_000))
+    (tmp_path / "session").write_bytes(bytes(20_000_000))
+    with pytest.raises(UnusableError, match="writes about"):
+        demo._require_resources(["probe"], tmp_path, None, 1)
+    (tmp_path / demo.MARK_NAME).touch()
+    demo._require_resources(["probe"], tmp_path, None, 1)
 
 
 def test_reconstruction_without_memory_is_refused_first(tmp_path, free, monkeypatch):
     rig = load_rig("dome")
-    opened = SimpleNamespace(manifest=SimpleNamespace(extra={}), rig=rig, plan=dome_plan(rig))
+    opened = SimpleNamespace(
+        manifest=SimpleNamespace(extra={}), rig=rig, plan=dome_plan(rig), content_hash="sha256:0"
+    )
     monkeypatch.setattr(reconstruction.Session, "open", lambda path: opened)
     monkeypatch.setattr(reconstruction, "reconstruct_session", refuse_scene)
     order = ReconstructionOrder(
@@ -201,16 +270,54 @@ def test_reconstruction_without_memory_is_refused_first(tmp_path, free, monkeypa
         dome=DomeOptions(),
     )
     free(1000.0)
+    run = functools.partial(reconstruction.reconstruct_sessions, executor="threads", progress=print)
     with pytest.raises(UnusableError, match="reconstruct dome needs about"):
-        next(reconstruction.reconstruct_sessions([order], executor="threads", progress=print))
+        next(run([order]))
+    inputs = {"session": opened.content_hash}
+    missing = (("normals", "too dark"),)
+    store.write(order.out, SkinAppearance({}, source="simulated", inputs=inputs, left_out=missing))
+    with pytest.raises(AssertionError, match="work began"):
+        next(run([order]))
+    opened.content_hash = "sha256:1"
+    with pytest.raises(UnusableError, match="reconstruct dome needs about"):
+        next(run([order]))
 
 
 def test_study_without_memory_is_refused_first(tmp_path, free):
-    cases = [SimpleNamespace(rig="dome", size=CaseSize(width_px=width)) for width in (96, 640)]
-    free(2000.0)
-    with pytest.raises(UnusableError, match="dome in 4 processes needs about"):
-        study._require_room(cases, "local:4", tmp_path)
-    study._require_room(cases[:1], "threads", tmp_path)
+    group = CaseGroup(rig="flash", subjects=("I",), seeds="1..4", sizes=(CaseSize(width_px=64),))
+    cases = StudyFile(schema="skinrig.study/1", title="Some cases", groups=(group,))
+    free(600.0)
+    with pytest.raises(UnusableError, match="flash in 4 processes needs about"):
+        run_study(cases, tmp_path, executor="local:4", judge=refuse_scene)
+    free(1000.0)
+    run_study(cases, tmp_path, judge=judge_by_drawing)
+    free(100.0)
+    again = run_study(cases, tmp_path, executor="local:4", judge=refuse_scene)
+    assert (again.ran, len(again.quantities)) == (0, 4)
+
+
+def test_nearly_complete_session_resumes(tmp_path, free, monkeypatch):
+    """What the session holds is no longer written; a complete one needs nothing."""
+    out = tmp_path / "s"
+    order = {"target": "white", "width_px": 48}
+    commit, numbers = Session.commit, itertools.count()
+
+    def commit_some(self, *args, **more):
+        if next(numbers) == 4:
+            raise KeyboardInterrupt
+        return commit(self, *args, **more)
+
+    monkeypatch.setattr(Session, "commit", commit_some)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_session("flash", out, **order)
+    (out / "frames/more.bin").write_bytes(bytes(4_000_000))
+    free(math.inf)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(9, 9, 100_000))
+    with pytest.raises(UnusableError, match="writes about"):
+        simulate_session("flash", tmp_path / "new", **order)
+    simulate_session("flash", out, resume=True, **order)
+    free(1.0)
+    assert simulate_session("flash", out, resume=True, **order).frames > 4
 
 
 def limit_addresses():

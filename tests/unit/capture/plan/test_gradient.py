@@ -194,7 +194,9 @@ def test_plan_time_is_sum_of_light_rotations_moves():
     light = 4 * 16 * 0.031 + 4 * 0.15
     # 0.4 s a step of the jaws: one, one, three back across neutral; the analyzer turns meanwhile
     moves = 0.4 * (1 + 1 + 3) + 4 * RIG.caliper.settle_s
-    assert plan.estimate_duration_s(RIG) == pytest.approx(light + moves)
+    places_mm = np.linspace(-3.6, 6.8, 20_001)  # of the jaws before homing, at 1 mm/s
+    homing = np.abs(places_mm).mean()
+    assert plan.estimate_duration_s(RIG) == pytest.approx(light + moves + homing, rel=1e-4)
 
 
 # targets --------------------------------------------------------------------------------------

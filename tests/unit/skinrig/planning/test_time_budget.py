@@ -6,6 +6,8 @@ from dataclasses import replace
 import pytest
 
 from capture.plan import flash_plan
+from capture.plan.gradient import gradient_plan
+from capture.plan.probe import probe_plan
 from capture.rig import load_rig
 from skinrig.cli import main
 from skinrig.planning import flash, flash_observation, plans, time_budget
@@ -61,6 +63,29 @@ def test_insufficient_budget_error_states_sufficient_one(rig, generate):
     least_s = float(str(error.value).split("at least ")[1].split(" ")[0])
     assert least_s - 1.0 < total_s(rig, 1) <= least_s
     assert time_budget.choose_within_budget(generate, rig, plans.PlanRequest(budget_s=least_s))
+
+
+def test_probe_is_not_advised_narrower_images():
+    """The probe's command has no width."""
+    for name, advised in (("probe", False), ("flash", True)):
+        rig = load_rig(name)
+
+        def offer(rig, _, is_affordable, name=name):
+            assert not is_affordable(rig, probe_plan(rig) if name == "probe" else flash_plan(rig))
+            return ()
+
+        with pytest.raises(plans.PlanningError, match="raise it") as error:
+            time_budget.choose_within_budget(offer, rig, plans.PlanRequest(budget_s=1.0))
+        assert str(error.value).endswith("or lower --width") is advised
+
+
+@pytest.mark.parametrize(("width_px", "states"), [(128, False), (256, False), (1024, True)])
+def test_seconds_at_other_widths_are_assumption(width_px, states):
+    rig = load_rig("gradient").cropped(width_px)
+    error = plans.Forecast("normals", "deg", 1.0, (0.8, 1.2), None)
+    one = plans.PlanChoice(rig, gradient_plan(rig), (error,), 0.0, {"valid_share": 1.0}, ())
+    found = time_budget.choose_within_budget(lambda *_: [one], rig, plans.PlanRequest(budget_s=1e6))
+    assert any("are an assumption" in line for line in plans.format_choice(found)) is states
 
 
 def test_run_times_are_linear_in_frame_pixels(rig):
