@@ -13,7 +13,7 @@ import numpy as np
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
 from rigsim.geometry.mesh import Mesh, build_mesh, center_face
-from rigsim.subject import SimulatedSubject, make_subject
+from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import is_fused
@@ -222,6 +222,11 @@ def build_scene(
     if people and paths:
         raise SceneError(
             "--people: got simulated people and an appearance; show one of both, or a page each"
+        )
+    unknown = [one for one in people if one not in PRESET_NAMES]
+    if unknown:
+        raise SceneError(
+            f"--people: got {unknown[0]!r}, expected {', '.join(PRESET_NAMES)}; correct it"
         )
     if len(people) > MAX_PEOPLE:
         raise SceneError(f"--people: got {len(people)} types, expected at most {MAX_PEOPLE}")

@@ -144,6 +144,7 @@ WORK = {"flash": FLASH, "dome": DOME, "gradient": GRADIENT, "probe": PROBE}
 SLOW = ("gradient", "probe")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 @pytest.mark.parametrize(
     ("rig", "transport"),

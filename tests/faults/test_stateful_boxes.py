@@ -43,6 +43,7 @@ def test_controller_obeys_rules_on_noisy_line_long_run(box):
     explore(host, 120, steps=steps)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("box", "leave_out", "caught_by"), LEFT_OUT)
 def test_controller_missing_any_rule_is_detected(monkeypatch, box, leave_out, caught_by):
     leave_out(monkeypatch)

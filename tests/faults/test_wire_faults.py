@@ -63,6 +63,7 @@ def test_nothing_is_done_twice_or_wrongly_acknowledged(world, ledger, number, fa
     assert not simulated.box("flash").device.lit
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # pyserial leaves sockets to the collector
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
 @pytest.mark.parametrize(

@@ -246,6 +246,7 @@ def test_listening_keeps_head_and_light_silence_loses_both(bench):
     assert not bench.world.head_at(bench.world.now).placed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", ["dark", "close", "reset", "take_away"])
 def test_release_commands_end_light_and_suction(bench, end):
     light(bench.box)

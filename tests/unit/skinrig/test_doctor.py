@@ -51,6 +51,7 @@ def test_renderer_of_sessions_is_reported(asked, renderer, monkeypatch):
     assert ("apt-get install" in finding.fix) == (renderer == "fast")
 
 
+@pytest.mark.long
 def test_port_is_judged_instead_of_installation(capsys):
     with serve_world("flash", pty=True) as served:
         status = main(["doctor", "--port", served.addresses["flash"], "--json"])

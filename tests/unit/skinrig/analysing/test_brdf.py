@@ -98,6 +98,7 @@ def test_the_darkest_person_has_a_surface_too(basis):
     assert np.all(np.diff(found.curve.error) < 0.0)
 
 
+@pytest.mark.long
 def test_single_condition_is_dataset_and_conditions_share_points():
     rng = np.random.default_rng(5)
     only = brdf_space_datasets.build_dataset_a(40, conditions=("lotion",), rng=rng)

@@ -110,6 +110,7 @@ def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
     assert found.parameters["fusion"]["maps"]["melanin"] == ["dome", "flash"]
 
 
+@pytest.mark.long
 def test_fuse_writes_common_and_own_errors(folders, tmp_path):
     fuse(both(folders), out=tmp_path / "double")
     maps = store.read(tmp_path / "double").maps

@@ -140,6 +140,7 @@ def test_chromophores_of_flash_maps_reach_their_place(subject, folder):
     assert "blood of expressions" in dict(found.left_out)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("blood", [True, False])
 def test_small_flash_maps_without_blood_are_shown(subject, folder, blood):
     """Fewer texels than the person has; dark skin has no valid blood."""
