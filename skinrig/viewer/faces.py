@@ -219,17 +219,7 @@ def build_scene(
         raise SceneError(
             "--calibration: got a folder without a dome's appearance; give the appearance, too"
         )
-    if people and paths:
-        raise SceneError(
-            "--people: got simulated people and an appearance; show one of both, or a page each"
-        )
-    unknown = [one for one in people if one not in PRESET_NAMES]
-    if unknown:
-        raise SceneError(
-            f"--people: got {unknown[0]!r}, expected {', '.join(PRESET_NAMES)}; correct it"
-        )
-    if len(people) > MAX_PEOPLE:
-        raise SceneError(f"--people: got {len(people)} types, expected at most {MAX_PEOPLE}")
+    _check_people(people, paths)
     preset = people[0] if people else preset
     folders, appearances = _read(paths)
     if PICTURE_KIND in folders:
@@ -278,6 +268,21 @@ def build_scene(
         )
     found = found.with_assets({"left_out": tuple(left_out)})
     return found if whole is None else _paint_patches(found, whole)
+
+
+def _check_people(people: Sequence[str], paths: Sequence[Path]) -> None:
+    """Raise for people together with an appearance, unknown ones, or too many."""
+    if people and paths:
+        raise SceneError(
+            "--people: got simulated people and an appearance; show one of both, or a page each"
+        )
+    unknown = [one for one in people if one not in PRESET_NAMES]
+    if unknown:
+        raise SceneError(
+            f"--people: got {unknown[0]!r}, expected {', '.join(PRESET_NAMES)}; correct it"
+        )
+    if len(people) > MAX_PEOPLE:
+        raise SceneError(f"--people: got {len(people)} types, expected at most {MAX_PEOPLE}")
 
 
 def _build_people(people: Sequence[str], seed: int, size: int, surface: Mesh | None) -> Assets:
