@@ -2,7 +2,7 @@
 
 One operator, number or statement is changed at a time, in a child of a process that has loaded the
 tests. The mutants are drawn by a seed. Outcomes go to tools/mutants.csv as they are found, and
-another run continues there; a mutant of a changed line is judged anew. Survivors keep the reason in
+another run continues there; a mutant of a changed line runs again. Survivors keep the reason in
 the column `why` that a person has written.
 
 python tools/measure_mutants.py --groups session,lines,rules --count 60 [--budget 600]
@@ -146,7 +146,7 @@ def list_places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int | None, fr
         node = held if number is None else held[number]
         if functions and isinstance(node, (ast.expr, ast.stmt)):
             yield parent, name, number, functions
-        if not isinstance(node, (ast.Raise, ast.JoinedStr)):  # what messages contain is no rule
+        if not isinstance(node, (ast.Raise, ast.JoinedStr)):  # texts of messages are not mutated
             yield from visit(node, functions)
 
     return visit(tree, frozenset())

@@ -297,7 +297,7 @@ def test_study_without_memory_is_refused_first(tmp_path, free):
 
 
 def test_nearly_complete_session_resumes(tmp_path, free, monkeypatch):
-    """What the session holds is no longer written; a complete one needs nothing."""
+    """Frames on the disk need no more room; a complete session needs none."""
     out = tmp_path / "s"
     order = {"target": "white", "width_px": 48}
     commit, numbers = Session.commit, itertools.count()
