@@ -13,6 +13,20 @@ from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 
 CFA_CHANNELS: Final = {"R": 0, "G": 1, "B": 2}
+
+
+def filter_channels(cfa: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the channels of a Bayer sensor's 2 x 2 cell.
+
+    Examples
+    --------
+    >>> filter_channels("RGGB")
+    ((0, 1), (1, 2))
+    """
+    a, b, c, d = (CFA_CHANNELS[color] for color in cfa)
+    return (a, b), (c, d)
+
+
 """Layer of each filter color in camera RGB."""
 
 
@@ -144,7 +158,8 @@ def expose_sensor(
     ----------
     irradiance_rgb
         Light behind each filter as fraction of full scale in the center of an ideal
-        sensor, shape (H, W, 3), >= 0; a MONO sensor accepts (H, W) and averages three channels.
+        sensor, shape (H, W, 3), >= 0, or behind each pixel's own filter, shape (H, W). A MONO
+        sensor averages three channels.
     sensor
         The sensor.
     rng
@@ -188,7 +203,7 @@ def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
     Parameters
     ----------
     light
-        Camera RGB, shape (H, W, 3), or (H, W) for MONO.
+        Camera RGB, shape (H, W, 3), or the light behind each pixel's filter, (H, W).
     cfa
         Colors of the 2 x 2 cell read row by row, or MONO.
 
@@ -203,13 +218,12 @@ def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
     [[1.0, 2.0], [2.0, 3.0]]
     """
     image = np.asarray(light, np.float32)
-    if cfa == "MONO":
-        if image.ndim == 2:
-            return image.copy()
-        if image.ndim == 3:
-            return np.asarray(image.mean(axis=-1), np.float32)
+    if image.ndim == 2:
+        return image.copy()
+    if image.ndim == 3 and cfa == "MONO":
+        return np.asarray(image.mean(axis=-1), np.float32)
     if image.ndim != 3 or image.shape[-1] != 3:
-        raise SensorError(f"irradiance_rgb: got shape {image.shape}, expected (H, W, 3)")
+        raise SensorError(f"irradiance_rgb: got shape {image.shape}, expected (H, W, 3) or (H, W)")
     out = np.empty(image.shape[:2], np.float32)
     for index, color in enumerate(cfa):
         row, column = divmod(index, 2)

@@ -18,6 +18,7 @@ to the kernel: the far rings of diffraction, and the glare of real lenses, are n
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -289,10 +290,30 @@ class LensImage:
         ndarray of float32
             Shape (H, W, C); only the samples emit light.
         """
-        out = np.zeros((*self.shape, rows.shape[1]), np.float32)
-        if len(rows):
-            light = np.ascontiguousarray(rows, np.float32)
-            _gather(*self._samples, self._cut, self._far, light, out)
+        columns = np.asarray(rows, np.float32).T
+        each = [self.render_mosaic([column], np.zeros((2, 2), np.int64)) for column in columns]
+        return np.stack(each, axis=-1)
+
+    def render_mosaic(self, columns: Sequence[ArrayLike], cell: ArrayLike) -> Float32Array:
+        """Return the channel of each pixel's filter, the same numbers as those of `render`.
+
+        Parameters
+        ----------
+        columns
+            Radiance of each sample by channel, C of shape (n,).
+        cell
+            Channels of the sensor's 2 x 2 cell, below C, shape (2, 2).
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W).
+        """
+        out = np.zeros(self.shape, np.float32)
+        light = np.array(columns, np.float32)
+        if light.size:
+            channels = np.ascontiguousarray(cell, np.int64)
+            _gather(*self._samples, self._cut, self._far, light, channels, out)
         return out
 
 
@@ -363,22 +384,26 @@ def _layers(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _gather(  # type: ignore[no-untyped-def]
-    lookup, first, slot, slices, toward, table, radius, cut, far, rows, out
+    lookup, first, slot, slices, toward, table, radius, cut, far, light, cell, out
 ):
+    """Sum the samples around each pixel; unsigned indices are not wrapped and halve the time."""
     height, width = lookup.shape
     wide = 2 * radius + 1
-    channels = rows.shape[1]
     for y in prange(height):
         for x in range(width):
+            column = light[cell[y % 2, x % 2]]
+            edge, behind = cut[y, x], far[y, x]
+            total = np.float32(0.0)
             for v in range(max(y - radius, 0), min(y + radius + 1, height)):
+                line = lookup[v]
+                row = (v - y + radius) * wide + radius - x
                 for u in range(max(x - radius, 0), min(x + radius + 1, width)):
-                    q = lookup[v, u]
-                    if q < 0:
+                    if line[u] < 0:
                         continue
-                    b = (v - y + radius) * wide + u - x + radius
-                    for i in range(first[q], first[q + 1]):
-                        w = table[slices[i], b, slot[i]]
-                        if toward[i] < cut[y, x]:
-                            w *= far[y, x]
-                        for c in range(channels):
-                            out[y, x, c] += w * rows[i, c]
+                    q, b = np.uint64(line[u]), np.uint64(row + u)
+                    for sample in range(first[q], first[q + np.uint64(1)]):
+                        i = np.uint64(sample)
+                        w = table[np.uint64(slices[i]), b, np.uint64(slot[i])]
+                        w *= behind if toward[i] < edge else np.float32(1.0)
+                        total += w * column[i]
+            out[y, x] = total

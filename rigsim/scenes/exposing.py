@@ -84,7 +84,7 @@ class RigScene:
     seed: int
     """Seeds the variation between exposures."""
     channels: tuple[int, ...] = (3,)
-    """Shape of the light on a pixel: camera RGB, or () for the one band of a camera."""
+    """Shape of the light on a pixel: camera RGB, or () for that behind its filter."""
     needs: EffectSelection
     """Effects with their verdicts and reasons."""
     stripes: StripeExposures | None = None

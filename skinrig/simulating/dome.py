@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shutil
+from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -23,6 +25,7 @@ from rigsim.population.conditions import ConditionError, validate_conditions
 from rigsim.population.population import PopulationError, get_member
 from rigsim.scanner.flaws import encode_binary_ply
 from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
+from rigsim.scenes.dome.images import IMAGE_CACHE_BYTES
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.dome.stripes import scan_board
 from rigsim.scenes.dome.stripes import scan_face as scan_face_by_stripes
@@ -33,6 +36,7 @@ from rigsim.targets import make_target
 from skinrig.console import select_attributes
 from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
+from skinrig.resources.forecast import count_megapixels, forecast_resources
 from skinrig.simulating import driving, reference
 from skinrig.simulating.orders import (
     DomeOrder,
@@ -74,6 +78,7 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     scene = _scene(rig, order, plan)
     session = driving.open_session(order, plan, rig, settings, scene)
     with driving.release_on_error(session):
+        _store_images(scene, order, rig, plan)
         attach = order.target is None and not order.scanner
         scan = _attach_scan(session, scene, order) if attach else {}
 
@@ -102,6 +107,21 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
             **select_attributes(scene, "subsurface", "interreflections"),
         )
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
+
+
+def _store_images(scene: Any, order: DomeOrder, rig: Rig, plan: Plan) -> None:
+    """Let a scene store images in a file if the plan returns to more than memory caches.
+
+    The file takes half of the space that the session leaves.
+    """
+    uses = Counter(light for step in plan.steps for light in step_lights(step))
+    pixels = sum(view.width_px * view.height_px for view in rig.views)
+    image_bytes = np.dtype(np.float32).itemsize * pixels * len(uses)
+    returns = max(uses.values(), default=0) > 1
+    if order.target is None and returns and image_bytes > IMAGE_CACHE_BYTES:
+        need = forecast_resources("simulate dome", count_megapixels(rig, plan))
+        free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
+        scene.store_images(order.out.parent, max(0, int(free) // 2))
 
 
 def _manifest_settings(

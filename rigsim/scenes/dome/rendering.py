@@ -19,6 +19,7 @@ from rigsim.mitsuba.rig_camera import describe_camera
 from rigsim.mitsuba.scene_radiance import load_description
 from rigsim.mitsuba.startup import load_mitsuba
 from rigsim.mitsuba.variant import VariantChoice
+from rigsim.sensor import apply_cfa, filter_channels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +123,7 @@ class MitsubaScene:
         return lens_of_hits(hits, view, settings) if settings.optics else hits
 
     def render(
-        self, seen: RenderedView, light: int, color: Float32Array, added: AddedLight
+        self, seen: RenderedView, light: int, color: Float32Array, added: AddedLight, cfa: str = ""
     ) -> Float32Array:
         """Return the image of one light.
 
@@ -136,14 +137,17 @@ class MitsubaScene:
             Intensity on its axis, shape (3,), see `rigsim.light.led_light`.
         added
             Subsurface light, and the relief's visible fraction.
+        cfa
+            Pattern of Bayer filters; empty: all channels of each pixel.
 
         Returns
         -------
         ndarray of float32
-            Shape (H, W, 3), in full scales per second, averaged over whole pixels.
+            Shape (H, W, 3), behind the filters (H, W), in full scales per second, averaged over
+            whole pixels.
         """
         if not seen.image_hits.count:
-            return np.zeros((*seen.hits.shape, 3), np.float32)
+            return np.zeros(seen.hits.shape if cfa else (*seen.hits.shape, 3), np.float32)
         load_mitsuba(self._choice)  # the variant is a state of the process
         if self._lamps is not seen.lamps:
             self._leds.set_table(_table(seen.lamps))
@@ -151,9 +155,17 @@ class MitsubaScene:
         parts = self._integrator.shade(self._scene, seen.image_hits, self._leds, light, added)
         scale = np.float32(np.pi) * np.asarray(color, np.float32)
         if seen.hits.lens is None:
-            return self._integrator.develop(seen.image_hits, parts, scale)
+            image = self._integrator.develop(seen.image_hits, parts, scale)
+            return apply_cfa(image, cfa) if cfa else image
         columns = [np.concatenate([np.array(p[c]) for p in parts]) for c in range(3)]
-        return seen.hits.lens.render(np.stack(columns, axis=1)) * scale
+        if not cfa:
+            return seen.hits.lens.render(np.stack(columns, axis=1)) * scale
+        cell = np.array(filter_channels(cfa))
+        image = seen.hits.lens.render_mosaic(columns, cell)
+        image *= np.tile(scale[cell], -(-np.array(image.shape) // 2))[
+            : image.shape[0], : image.shape[1]
+        ]
+        return image
 
 
 def _table(lamps: Sequence[Lamp]) -> Float32Array:

@@ -67,6 +67,11 @@ class DomeRows:
         self._rendered: LruCache[tuple[str, float], RenderedView] = LruCache(lambda _: most)
         self._scenes: LruCache[tuple[str, float], MitsubaScene] = LruCache(lambda _: most)
 
+    @property
+    def is_still(self) -> bool:
+        """Whether the head does not move."""
+        return self._motion is None
+
     def pose_time_s(self, t_s: float) -> float:
         """Return the time that determines the head's pose, s; 0 for a fixed head."""
         return 0.0 if self._motion is None else round(t_s, 4)

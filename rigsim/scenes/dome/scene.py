@@ -17,6 +17,7 @@ responses, dead LEDs and crossed wires.
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import ActualDome
 from rigsim.boxes.led_table import LedPulse
-from rigsim.caching import LruCache, cached_method
+from rigsim.caching import cached_method
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import InterreflectionSettings, interreflection_for
@@ -49,20 +50,16 @@ from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.scenes.dome import truth as dome_truth
+from rigsim.scenes.dome.images import LightImages
 from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, normalize
 from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
+from rigsim.sensor import apply_cfa
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
 LED_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy between pulses."""
-
-MAX_CACHED_FRAMES: Final = 16
-"""Cached frames of any size: one light of all cameras, so that a second exposure costs nothing."""
-FRAME_CACHE_BYTES: Final = 2**29
-SMALL_FRAME_BYTES: Final = 2**22
-"""Frames up to this size fill the cache, so that a small session's second pass costs nothing."""
 
 
 class DomeScene(FaceScene):
@@ -100,6 +97,8 @@ class DomeScene(FaceScene):
         Mitsuba variant; ``None`` chooses. A vectorized one renders Mitsuba's scene by the
         integrator `olat`; otherwise compiled loops shade.
     """
+
+    channels = ()
 
     def __init__(
         self,
@@ -152,13 +151,7 @@ class DomeScene(FaceScene):
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
         how = CameraSettings(subpixels, self._illuminant, self.optics)
         self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
-        # a capture returns to each light in its next pass
-        self._frames: LruCache[tuple[str, int, float], Float32Array] = LruCache(
-            lambda frame: max(
-                MAX_CACHED_FRAMES,
-                FRAME_CACHE_BYTES // frame.nbytes if frame.nbytes <= SMALL_FRAME_BYTES else 0,
-            )
-        )
+        self._images = LightImages()  # a capture returns to each light in its next pass
 
     @property
     def variant(self) -> VariantChoice:
@@ -262,8 +255,8 @@ class DomeScene(FaceScene):
         def frame(pulse: LedPulse) -> Float32Array:
             middle = self._rows.pose_time_s(0.5 * (pulse.t_on_s + pulse.t_off_s))
             led = self.dome.light_of_channel(pulse.led)
-            render = partial(self._render, view, led, middle)
-            return self._frames.get((view.name, led, middle), render)
+            render = partial(self._mosaic, view, led, middle)
+            return self._images.get((view.name, led, middle), render)
 
         return self._expose(
             view,
@@ -394,12 +387,26 @@ class DomeScene(FaceScene):
         layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
         return dilate_texture(layers, self._face().atlas.covered)
 
+    def store_images(self, folder: Path, most_bytes: int) -> None:
+        """Store the images of each light in a file, see `ImageFile`; none of a head that moves."""
+        if self._rows.is_still:
+            self._images.store(folder, most_bytes)
+
+    def _mosaic(self, view: View, light: int, t_s: float) -> Float32Array:
+        """Return the light behind each pixel's filter, (H, W), see `radiance`."""
+        if view.cfa == "MONO" or self._caster.choice.renderer != "mitsuba":
+            return apply_cfa(self._render(view, light, t_s), view.cfa)
+        return self._shade(view, light, t_s, view.cfa)
+
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
+        return self._shade(view, light, t_s)
+
+    def _shade(self, view: View, light: int, t_s: float, cfa: str = "") -> Float32Array:
         if not 0 <= light < len(self.rig.lights):
             raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
-        shape = (view.height_px, view.width_px, 3)
+        shape = (view.height_px, view.width_px)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
-            return np.zeros(shape, np.float32)
+            return np.zeros(shape if cfa else (*shape, 3), np.float32)
         hits, caster = self._visible_rows(view, t_s)
         lamp = self._rows.lamp(light, t_s)
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
@@ -411,7 +418,8 @@ class DomeScene(FaceScene):
         relief = self._relief_of(hits, lamp)
         if self._caster.choice.renderer == "mitsuba":
             seen = self._rows.rendered_view(view, t_s, self._texture)
-            return seen.scene.render(seen, light, color, AddedLight(glow, relief, not diffuse))
+            added = AddedLight(glow, relief, not diffuse)
+            return seen.scene.render(seen, light, color, added, cfa)
         visible = olat.is_lamp_visible(hits, caster, lamp)
         return olat.shade_rows(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
 
