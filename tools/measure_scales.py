@@ -1,10 +1,10 @@
-"""Run one rig from its targets to a report and an export at small, half or full scale, and tabulate.
+"""Run one rig from its targets to a report and an export at three scales, and tabulate them.
 
 Each step is a command of its own, whose seconds, processor seconds, peak memory and written bytes
 are recorded. A step that is recorded is not run again; one that was interrupted continues. Full
 scale is that of the papers: dome of 16 cameras, 150 lights and 1300 x 1030 pixels with its scan,
-flash rig of 3024 x 2016 pixels with 7 expressions and a sequence, gradient rig of 2048 x 2048 pixels
-with 4 angles of the caliper, probe with 3 sites and 16 directions. Half has half the width.
+flash rig of 3024 x 2016 pixels with 7 expressions and a sequence, gradient rig of 2048 x 2048
+pixels with 4 angles of the caliper, probe with 3 sites and 16 directions. Half has half the width.
 
     python tools/measure_scales.py run dome --scale full --out full-dome
     python tools/measure_scales.py table small-dome half-dome full-dome
@@ -62,7 +62,8 @@ Step = tuple[str, list[str]]
 def list_steps(rig: str, scale: str, seed: int) -> Iterator[Step]:
     """Yield name and arguments of each step, with paths relative to the output."""
     full = scale == "full"
-    size = ["--scale", "full" if full or rig in ("dome", "probe") and scale == "half" else "small"]
+    whole = full or (rig in ("dome", "probe") and scale == "half")
+    size = ["--scale", "full" if whole else "small"]
     width = [] if rig == "probe" else ["--width", str(WIDTHS_PX[rig][scale])]
     simulate = ["simulate", rig, "--seed", str(seed), *size]
     for target in TARGETS[rig]:
