@@ -231,6 +231,37 @@ def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
     return out
 
 
+def color_filters(gray: ArrayLike, color: ArrayLike, cfa: str) -> Float32Array:
+    """Return light of one color behind each pixel's filter.
+
+    Parameters
+    ----------
+    gray
+        Light, or light behind the filters before its color, shape (H, W).
+    color
+        Factor of each channel, shape (3,).
+    cfa
+        Colors of the 2 x 2 cell read row by row; MONO takes the mean of the factors.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (H, W).
+
+    Examples
+    --------
+    >>> color_filters(np.ones((2, 3)), [1.0, 2.0, 3.0], "RGGB").tolist()
+    [[1.0, 2.0, 1.0], [2.0, 3.0, 2.0]]
+    """
+    out = np.array(gray, np.float32)
+    if cfa == "MONO":
+        return np.asarray(out * np.asarray(color, np.float32).mean(), np.float32)
+    for row, channels in enumerate(filter_channels(cfa)):
+        for column, channel in enumerate(channels):
+            out[row::2, column::2] *= np.asarray(color, np.float32)[channel]
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
     """Variation between pixels that is constant between frames."""

@@ -129,7 +129,7 @@ def run(rig: str, scale: str, seed: int, out: Path) -> dict[str, Any]:
     """Run the steps that are not recorded yet, and return the record."""
     out.mkdir(parents=True, exist_ok=True)
     written = out / RECORD_NAME
-    fresh = {"rig": rig, "scale": scale, "seed": seed, "cores": os.cpu_count(), "steps": {}}
+    fresh: dict[str, Any] = {"rig": rig, "scale": scale, "seed": seed, "cores": os.cpu_count(), "steps": {}}
     record = json.loads(written.read_text("utf-8")) if written.exists() else fresh
     asked = (rig, scale, seed)
     if (record["rig"], record["scale"], record["seed"]) != asked:

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -68,7 +69,9 @@ class ImageFile:
 
     def __init__(self, folder: Path, most_bytes: int) -> None:
         # a name would outlive a killed process
-        self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        weakref.finalize(self, file.close)
+        self._file = file.fileno()
         self._most_bytes, self._end = most_bytes, 0
         self._stored: dict[ImageKey, tuple[int, tuple[int, ...], int, int]] = {}
         """Offset, shape, first row and number of rows by key."""
@@ -79,7 +82,7 @@ class ImageFile:
             offset, shape, top, count = self._stored[key]
             out = np.zeros(shape, np.float32)
             rows = out[top : top + count]
-            if not rows.nbytes or os.preadv(self._file.fileno(), [rows], offset) == rows.nbytes:
+            if not rows.nbytes or os.preadv(self._file, [rows.data], offset) == rows.nbytes:
                 return out
         image = render()
         self._append(key, image)
@@ -92,6 +95,6 @@ class ImageFile:
         if self._end + rows.nbytes > self._most_bytes:
             return
         with suppress(OSError):  # of a full disk
-            if not rows.nbytes or os.pwrite(self._file.fileno(), rows, self._end) == rows.nbytes:
+            if not rows.nbytes or os.pwrite(self._file, rows.data, self._end) == rows.nbytes:
                 self._stored[key] = self._end, image.shape, top, end - top
                 self._end += rows.nbytes

@@ -19,7 +19,7 @@ from rigsim.mitsuba.rig_camera import describe_camera
 from rigsim.mitsuba.scene_radiance import load_description
 from rigsim.mitsuba.startup import load_mitsuba
 from rigsim.mitsuba.variant import VariantChoice
-from rigsim.sensor import apply_cfa, filter_channels
+from rigsim.sensor import apply_cfa, color_filters, filter_channels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,12 +160,8 @@ class MitsubaScene:
         columns = [np.concatenate([np.array(p[c]) for p in parts]) for c in range(3)]
         if not cfa:
             return seen.hits.lens.render(np.stack(columns, axis=1)) * scale
-        cell = np.array(filter_channels(cfa))
-        image = seen.hits.lens.render_mosaic(columns, cell)
-        image *= np.tile(scale[cell], -(-np.array(image.shape) // 2))[
-            : image.shape[0], : image.shape[1]
-        ]
-        return image
+        image = seen.hits.lens.render_mosaic(columns, filter_channels(cfa))
+        return color_filters(image, scale, cfa)
 
 
 def _table(lamps: Sequence[Lamp]) -> Float32Array:

@@ -23,7 +23,7 @@ from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, decide_eff
 from rigsim.package_data import package_table
 from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
-from rigsim.sensor import expose_sensor, make_sensor
+from rigsim.sensor import color_filters, expose_sensor, make_sensor
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
 
@@ -156,9 +156,9 @@ class TargetScene(RigScene):
             light = self.dome.light_of_channel(pulse.led)
             if self.rig.lights[light].name not in self.dome.dead:
                 on_s[light] += energy * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
-        return expose_sensor(
-            self.light(view_name, on_s), sensor=make_sensor(view), rng=rng, exposure_s=exposure_s
-        )
+        gray, color = self._lit(view, on_s)
+        signal = color_filters(gray, color, view.cfa)
+        return expose_sensor(signal, sensor=make_sensor(view), rng=rng, exposure_s=exposure_s)
 
     def light(self, view_name: str, on_s: Sequence[float] | Float64Array) -> Float32Array:
         """Return the light on a sensor without noise and vignetting, camera RGB, (H, W, 3).
@@ -170,14 +170,17 @@ class TargetScene(RigScene):
         on_s
             On-time of each light in s, times its level, shape (L,).
         """
-        view = self._camera(view_name)
-        seconds = np.asarray(on_s, np.float64)
+        gray, color = self._lit(self._camera(view_name), np.asarray(on_s, np.float64))
+        return np.asarray(gray[..., None] * color)
+
+    def _lit(self, view: View, seconds: Float64Array) -> tuple[Float32Array, Float32Array]:
+        """Return the light on a sensor by pixel, (H, W), and the factors of its channels, (3,)."""
         lit = np.nonzero(seconds > 0)[0]
         if not lit.size:
-            return np.zeros((view.height_px, view.width_px, 3), np.float32)
+            return np.zeros((view.height_px, view.width_px), np.float32), np.ones(3, np.float32)
         rgb = np.array([white_intensity(self.rig.lights[i], view) for i in lit])
         color = rgb[0] / rgb[0].max()
-        strength = seconds[lit] * rgb.max(axis=1) * self.dome.gain.get(view_name, 1.0)
+        strength = seconds[lit] * rgb.max(axis=1) * self.dome.gain.get(view.name, 1.0)
         lamps = (self._lamp_mm[lit], self.dome.axis[lit], self._exponent[lit], strength)
         if self.kind == "mirror":
             gray = self._ball(view, lit, lamps)
@@ -186,7 +189,7 @@ class TargetScene(RigScene):
             paper = (self._plate.reflectance, CELL_MM, self._plate.waviness)
             how = (paper, lamps, EDGE_SUBPIXELS)
             gray = printed_plate.render_plate(rays, eye, *self.plate_pose(), *how)
-        return np.asarray(gray[..., None] * color.astype(np.float32))
+        return np.asarray(gray), color.astype(np.float32)
 
     def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
         """Return a plate's pose: rotation to the rig frame, position of its top left corner, mm.

@@ -8,7 +8,15 @@ import pytest
 from scipy import stats
 
 from capture.rig import load_rig
-from rigsim.sensor import Sensor, SensorError, apply_cfa, expose_sensor, fixed_pattern, make_sensor
+from rigsim.sensor import (
+    Sensor,
+    SensorError,
+    apply_cfa,
+    color_filters,
+    expose_sensor,
+    fixed_pattern,
+    make_sensor,
+)
 
 FALSE_ALARM = 1e-4  # two-sided, per statistical test below
 
@@ -181,3 +189,16 @@ def test_impossible_light_is_refused(ideal, rng, light):
     sensor = dataclasses.replace(ideal, cfa="RGGB")
     with pytest.raises(SensorError, match="irradiance_rgb"):
         expose_sensor(light, sensor=sensor, rng=rng)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "MONO"])
+def test_light_behind_filters_gives_frame_of_colors(ideal, cfa):
+    sensor = dataclasses.replace(ideal, cfa=cfa)
+    color = np.array([0.25, 0.5, 0.125], np.float32)
+    light = gray(0.5, (5, 7))[..., None] * color
+    behind = color_filters(gray(0.5, (5, 7)), color, cfa)
+    assert behind == pytest.approx(apply_cfa(light, cfa))
+    frames = [
+        expose_sensor(one, sensor=sensor, rng=np.random.default_rng(3)) for one in (light, behind)
+    ]
+    assert np.array_equal(*frames)

@@ -25,6 +25,7 @@ from rigsim.render.depth_of_field import (
 from rigsim.render.lens_blur import BlurError, focused_lens
 from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace
 from rigsim.scenes.flash.scene import FlashScene
+from rigsim.sensor import apply_cfa, filter_channels
 from rigsim.subject.person import make_subject
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
@@ -240,3 +241,30 @@ def test_focus_is_at_target_unless_view_overrides(rig):
     tip = np.array([[0.0, 0.0, 25.0]], np.float32)
     assert depth_before_focus(cam, tip)[0] == pytest.approx(25.0, abs=1e-3)
     assert depth_before_focus(nearer, tip)[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_mosaic_has_the_channels_of_the_image(rig):
+    """Bit for bit, at an edge in depth, with pixels that lack samples, and an odd size."""
+    rng = np.random.default_rng(4)
+    depth = np.where(np.arange(46) < 20, NEAR_MM, FAR_MM) * np.ones((38, 1))
+    depth[rng.random(depth.shape) < 0.1] = np.nan
+    order = pixel_order(np.isfinite(depth), K)[0]
+    rows = rng.random((len(order), 3), np.float32)
+    lens = planes(wide_open(rig, 2.0), depth)
+    for cfa in ("RGGB", "GBRG"):
+        mosaic = lens.render_mosaic(rows.T, filter_channels(cfa))
+        assert np.array_equal(mosaic, apply_cfa(lens.render(rows), cfa))
+    assert not np.array_equal(mosaic, apply_cfa(lens.render(rows), "RGGB"))
+
+
+def test_weights_of_plain_sum_agree_with_kernel(rig):
+    """Far from gaps in depth, a pixel is the sum of table times samples around it."""
+    spread = wide_open(rig, 4.0)
+    light = np.random.default_rng(5).random((40, 40))
+    seen = see(spread, np.full((40, 40), FAR_MM), light)
+    own = spread.table[spread.slices(FAR_MM)]
+    wide = 2 * spread.radius + 1
+    weights = own.reshape(wide, wide, K, K).transpose(0, 2, 1, 3).reshape(wide * K, wide * K)
+    top = K * (10 - spread.radius)
+    window = light[top : top + wide * K, top : top + wide * K]
+    assert seen[10, 10] == pytest.approx(float((weights * window).sum()), rel=1e-5)
