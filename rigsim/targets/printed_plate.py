@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from rigsim.arrays import BoolArray, Float64Array
+from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from rigsim.package_data import package_table
 from rigsim.targets.flat import WHITE_REFLECTANCE
+from rigsim.targets.mirror_ball import LampArrays
 
 CELL_MM: Final = 4.5
 """Side of a lattice cell, and of one bit of a marker."""
@@ -115,11 +116,51 @@ def _print_marker(light: BoolArray, number: int, top: int, left: int) -> None:
         light[top + 1 + row, left + 1 + column] = bool(bits >> (15 - k) & 1)
 
 
-@njit(cache=True, nogil=True)
-def render_plate(  # type: ignore[no-untyped-def]
-    rays, eye_mm, rotation, position_mm, paper, lights, subpixels
-):
-    """Return each pixel's signal of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlateImage:
+    """What a camera's pixels see of a plate, which serves all lights."""
+
+    shape: tuple[int, int]
+    """Rows and columns of the image."""
+    pixel: Int64Array
+    """Pixels that see print, index into the flat image, ascending, shape (n,)."""
+    surface: Float64Array
+    """Their reflectance, place x and y in mm, and slopes x and y, on the plate, shape (n, 5)."""
+
+    def render(
+        self, rotation: Float64Array, position_mm: Float64Array, lights: LampArrays
+    ) -> Float32Array:
+        """Return each pixel's signal: sum of ``strength lobe cos / d^2`` x reflectance.
+
+        Parameters
+        ----------
+        rotation, position_mm
+            Pose of the plate, as for `trace_plate`.
+        lights
+            Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,), strengths (L,).
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W); 0 outside the plate and behind it.
+        """
+        lamp_mm, lamp_axis, exponent, strength = lights
+        lamps = (lamp_mm - position_mm) @ rotation
+        out = np.zeros(self.shape[0] * self.shape[1], np.float32)
+        given = (lamps, lamp_axis @ rotation, exponent, strength)
+        _light_plate(self.pixel, self.surface, *given, out)
+        return out.reshape(self.shape)
+
+
+def trace_plate(
+    rays: Float64Array,
+    eye_mm: Float64Array,
+    rotation: Float64Array,
+    position_mm: Float64Array,
+    plate: Plate,
+    subpixels: int,
+) -> PlateImage:
+    """Trace a camera's pixels to a plate.
 
     Parameters
     ----------
@@ -127,31 +168,30 @@ def render_plate(  # type: ignore[no-untyped-def]
         Directions through the corners of pixels, shape (H + 1, W + 1, 3).
     eye_mm
         Center of projection, shape (3,).
-    rotation, place_mm
+    rotation, position_mm
         From the plate's axes to the rig frame, and the position of its top left corner.
-    paper
-        Reflectance, side of its cells in mm, and waviness, as of `Plate`.
-    lights
-        Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,).
+    plate
+        The plate.
     subpixels
         Rays along each side of pixels that an edge of print crosses.
-
-    Returns
-    -------
-    ndarray of float32
-        Shape (H, W); 0 outside the plate and behind it.
     """
-    reflectance, cell_mm, waviness = paper
-    lamp_mm, lamp_axis, lamp_exponent, lamp_strength = lights
-    height, width = rays.shape[0] - 1, rays.shape[1] - 1
-    out = np.zeros((height, width), np.float32)
+    shape = rays.shape[0] - 1, rays.shape[1] - 1
+    surface = np.zeros((*shape, 5))
     eye = rotation.T @ (eye_mm - position_mm)
-    if eye[2] >= 0.0:
-        return out
-    lamps = (lamp_mm - position_mm) @ rotation
-    axes = lamp_axis @ rotation
+    if eye[2] < 0.0:
+        turned = np.ascontiguousarray(rotation.T)
+        _trace_plate(rays, eye, turned, plate.reflectance, plate.waviness, subpixels, surface)
+    flat = surface.reshape(-1, 5)
+    pixel = np.flatnonzero(flat[:, 0])
+    return PlateImage(shape, pixel, flat[pixel])
+
+
+@njit(cache=True, nogil=True)
+def _trace_plate(  # type: ignore[no-untyped-def]
+    rays, eye, turned, reflectance, waviness, subpixels, out
+):
+    height, width = rays.shape[0] - 1, rays.shape[1] - 1
     rows, columns = reflectance.shape
-    turned = np.ascontiguousarray(rotation.T)
     # intersections of the pixel corners' rays with the plate's plane, in cells; far outside if none
     hit = np.empty((height + 1, width + 1, 2))
     for i in range(height + 1):
@@ -162,8 +202,8 @@ def render_plate(  # type: ignore[no-untyped-def]
                 hit[i, j, 1] = -1e9
             else:
                 s = -eye[2] / d[2]
-                hit[i, j, 0] = (eye[0] + s * d[0]) / cell_mm
-                hit[i, j, 1] = (eye[1] + s * d[1]) / cell_mm
+                hit[i, j, 0] = (eye[0] + s * d[0]) / CELL_MM
+                hit[i, j, 1] = (eye[1] + s * d[1]) / CELL_MM
     for i in range(height):
         for j in range(width):
             u_low = min(hit[i, j, 0], hit[i, j + 1, 0], hit[i + 1, j, 0], hit[i + 1, j + 1, 0])
@@ -197,12 +237,12 @@ def render_plate(  # type: ignore[no-untyped-def]
                 continue
             x_mm = (
                 0.25
-                * cell_mm
+                * CELL_MM
                 * (hit[i, j, 0] + hit[i, j + 1, 0] + hit[i + 1, j, 0] + hit[i + 1, j + 1, 0])
             )
             y_mm = (
                 0.25
-                * cell_mm
+                * CELL_MM
                 * (hit[i, j, 1] + hit[i, j + 1, 1] + hit[i + 1, j, 1] + hit[i + 1, j + 1, 1])
             )
             slope_x = 0.0
@@ -213,18 +253,29 @@ def render_plate(  # type: ignore[no-untyped-def]
                 wave = waviness[w, 0] * np.sin(kx * x_mm + ky * y_mm + waviness[w, 3])
                 slope_x += wave * kx / k
                 slope_y += wave * ky / k
-            length = (1.0 + slope_x * slope_x + slope_y * slope_y) ** 0.5
-            light = 0.0
-            for m in range(lamps.shape[0]):
-                dx, dy, dz = lamps[m, 0] - x_mm, lamps[m, 1] - y_mm, lamps[m, 2]
-                cosine = (slope_x * dx + slope_y * dy - dz) / length
-                if cosine <= 0.0:
-                    continue
-                square = dx * dx + dy * dy + dz * dz
-                d = square**0.5
-                off = -(axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz) / d
-                if off <= 0.0:
-                    continue
-                light += lamp_strength[m] * off ** lamp_exponent[m] * cosine / (d * square)
-            out[i, j] = value * light
-    return out
+            out[i, j, 0] = value
+            out[i, j, 1], out[i, j, 2] = x_mm, y_mm
+            out[i, j, 3], out[i, j, 4] = slope_x, slope_y
+
+
+@njit(cache=True, nogil=True)
+def _light_plate(  # type: ignore[no-untyped-def]
+    pixel, surface, lamps, axes, lamp_exponent, lamp_strength, out
+):
+    for n in range(len(pixel)):
+        value, x_mm, y_mm = surface[n, 0], surface[n, 1], surface[n, 2]
+        slope_x, slope_y = surface[n, 3], surface[n, 4]
+        length = (1.0 + slope_x * slope_x + slope_y * slope_y) ** 0.5
+        light = 0.0
+        for m in range(lamps.shape[0]):
+            dx, dy, dz = lamps[m, 0] - x_mm, lamps[m, 1] - y_mm, lamps[m, 2]
+            cosine = (slope_x * dx + slope_y * dy - dz) / length
+            if cosine <= 0.0:
+                continue
+            square = dx * dx + dy * dy + dz * dz
+            d = square**0.5
+            off = -(axes[m, 0] * dx + axes[m, 1] * dy + axes[m, 2] * dz) / d
+            if off <= 0.0:
+                continue
+            light += lamp_strength[m] * off ** lamp_exponent[m] * cosine / (d * square)
+        out[pixel[n]] = value * light

@@ -17,7 +17,7 @@ from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import ActualDome, build_dome, pixel_corner_rays, project_points
 from rigsim.boxes.led_table import LedPulse
-from rigsim.caching import cached_method
+from rigsim.caching import LruCache, cached_method
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, decide_effect, omitted_effects
 from rigsim.package_data import package_table
@@ -25,7 +25,7 @@ from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.sensor import color_filters, expose_sensor, make_sensor
 from rigsim.targets import mirror_ball, printed_plate
-from rigsim.targets.printed_plate import CELL_MM, Plate
+from rigsim.targets.printed_plate import Plate
 
 Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 
@@ -84,6 +84,9 @@ class TargetScene(RigScene):
         self.rig = dome.rig
         self.seed = seed
         self.pose = 0
+        self._seen: LruCache[tuple[str, int], printed_plate.PlateImage] = LruCache(
+            lambda _: len(self.rig.views)
+        )
         rng = np.random.default_rng([seed, len(kind)])
         self._plate = (
             printed_plate.white_plate(slope_deg=slope_deg, rng=rng)
@@ -185,10 +188,7 @@ class TargetScene(RigScene):
         if self.kind == "mirror":
             gray = self._ball(view, lit, lamps)
         else:
-            rays, eye = self._corner_rays(view), np.array(view.position_mm)
-            paper = (self._plate.reflectance, CELL_MM, self._plate.waviness)
-            how = (paper, lamps, EDGE_SUBPIXELS)
-            gray = printed_plate.render_plate(rays, eye, *self.plate_pose(), *how)
+            gray = self._seen_plate(view).render(*self.plate_pose(), lamps)
         return np.asarray(gray), color.astype(np.float32)
 
     def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
@@ -243,6 +243,12 @@ class TargetScene(RigScene):
         else:
             out["plate_pose"] = [self.plate_pose(k) for k in places]
         return out
+
+    def _seen_plate(self, view: View) -> printed_plate.PlateImage:
+        """Return what a camera sees of the plate in its present pose."""
+        rays, eye = self._corner_rays(view), np.array(view.position_mm)
+        how = (rays, eye, *self.plate_pose(), self._plate, EDGE_SUBPIXELS)
+        return self._seen.get((view.name, self.pose), lambda: printed_plate.trace_plate(*how))
 
     @cached_method
     def _corner_rays(self, view: View) -> Float64Array:
