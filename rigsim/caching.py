@@ -8,6 +8,8 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 KeyT = TypeVar("KeyT")
 ValueT = TypeVar("ValueT")
 Key = ParamSpec("Key")
+_PREFIX = "_kept_"
+"""Prefix of the attributes that hold results of cached methods."""
 
 
 class LruCache(Generic[KeyT, ValueT]):
@@ -42,7 +44,7 @@ def cached_method(
     make: Callable[Concatenate[Any, Key], ValueT],
 ) -> Callable[Concatenate[Any, Key], ValueT]:
     """Cache a method's results per arguments, for the lifetime of its object."""
-    name = f"_kept_{make.__name__}"
+    name = f"{_PREFIX}{make.__name__}"
 
     @wraps(make)
     def get(owner: Any, /, *key: Key.args, **named: Key.kwargs) -> ValueT:
@@ -53,3 +55,9 @@ def cached_method(
         return values[asked]
 
     return get
+
+
+def forget_cached(owner: Any) -> None:
+    """Remove the results of an object's cached methods; they are computed again on demand."""
+    for name in [name for name in vars(owner) if name.startswith(_PREFIX)]:
+        del vars(owner)[name]

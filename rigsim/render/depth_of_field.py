@@ -290,9 +290,11 @@ class LensImage:
         ndarray of float32
             Shape (H, W, C); only the samples emit light.
         """
-        columns = np.asarray(rows, np.float32).T
-        each = [self.render_mosaic([column], np.zeros((2, 2), np.int64)) for column in columns]
-        return np.stack(each, axis=-1)
+        out = np.zeros((*self.shape, rows.shape[1]), np.float32)
+        if len(rows):
+            light = np.ascontiguousarray(rows, np.float32)
+            _gather(*self._samples, self._cut, self._far, light, out)
+        return out
 
     def render_mosaic(self, columns: Sequence[ArrayLike], cell: ArrayLike) -> Float32Array:
         """Return the channel of each pixel's filter, the same numbers as those of `render`.
@@ -313,7 +315,7 @@ class LensImage:
         light = np.array(columns, np.float32)
         if light.size:
             channels = np.ascontiguousarray(cell, np.int64)
-            _gather(*self._samples, self._cut, self._far, light, channels, out)
+            _gather_mosaic(*self._samples, self._cut, self._far, light, channels, out)
         return out
 
 
@@ -384,9 +386,35 @@ def _layers(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _gather(  # type: ignore[no-untyped-def]
+    lookup, first, slot, slices, toward, table, radius, cut, far, rows, out
+):
+    """Sum the samples around each pixel. Unsigned indices are not wrapped, which saves time."""
+    height, width = lookup.shape
+    wide = 2 * radius + 1
+    channels = rows.shape[1]
+    for y in prange(height):
+        for x in range(width):
+            edge, behind = cut[y, x], far[y, x]
+            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
+                line = lookup[v]
+                row = (v - y + radius) * wide + radius - x
+                for u in range(max(x - radius, 0), min(x + radius + 1, width)):
+                    if line[u] < 0:
+                        continue
+                    q, b = np.uint64(line[u]), np.uint64(row + u)
+                    for sample in range(first[q], first[q + np.uint64(1)]):
+                        i = np.uint64(sample)
+                        w = table[np.uint64(slices[i]), b, np.uint64(slot[i])]
+                        w *= behind if toward[i] < edge else np.float32(1.0)
+                        for c in range(channels):
+                            out[y, x, c] += w * rows[i, c]
+
+
+@njit(parallel=True, cache=True)
+def _gather_mosaic(  # type: ignore[no-untyped-def]
     lookup, first, slot, slices, toward, table, radius, cut, far, light, cell, out
 ):
-    """Sum the samples around each pixel; unsigned indices are not wrapped and halve the time."""
+    """Do as `_gather` for the channel of each pixel's filter; `light` has a row per channel."""
     height, width = lookup.shape
     wide = 2 * radius + 1
     for y in prange(height):

@@ -1,12 +1,16 @@
 """Simulate captures with the flash rig: a face or a target, with the ground truth."""
 
 import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from model import store
+from model.skin import SkinAppearance
 from rigsim import targets
+from rigsim.caching import forget_cached
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
@@ -69,33 +73,21 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     texels = subject_records.choose_face_texels(width)
     if target is None and texels != subject_records.FACE_TEXELS:
         settings["texels"] = texels
-    scenes = _scenes(rig, order, plan)
-    first = next(iter(scenes.values()))
+    states_of = _StateScenes(_scene_makers(rig, order, plan), order)
+    first = states_of.first
     session = open_session(order, plan, rig, settings, first)
-
-    def prompt(world: Any, state: str) -> None:
-        world.scene = scenes[state]
-
-    rig_seconds = drive_plan(order, session, rig, first, prompt)
+    states_of.with_oxygenation = any("light" in step.settings for step in plan.steps)
+    rig_seconds = drive_plan(order, session, rig, first, states_of.prompt)
     if target is not None:
         return build_result(order, session, first, rig_seconds, None)
     truth = truth_folder(order.out)
-    has_leds = any("light" in step.settings for step in plan.steps)
-    about = subject_records.truth_parameters(order.subject, "flash", order.progress)
-    for state, scene in scenes.items():
+    for state in states:
         folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-        appearance = build_truth(
-            scene,
-            order.seed,
-            session.content_hash,
-            state,
-            parameters=about,
-            with_oxygenation=has_leds,
-        )
-        if isinstance(scene, VoxelFlashScene):
-            appearance = reference.add_voxels(scene, appearance)
+        appearance = states_of.describe(state, session.content_hash)
+        if isinstance(first, VoxelFlashScene):
+            appearance = reference.add_voxels(first, appearance)
         elif state == states[0]:
-            surface = face_surface(scene.subject, state, rig, scene.white_rgb())
+            surface = face_surface(first.subject, state, rig, first.white_rgb())
             files = {SURFACE_FILE: encode_arrays(surface)}
             appearance = dataclasses.replace(appearance, files=files)
         store.write(folder, appearance)
@@ -103,6 +95,50 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
         return build_result(order, session, first, rig_seconds, truth)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
+
+
+class _StateScenes:
+    """Scenes of a face by state; those that are left give way, as many would need much memory."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], Any]], order: FlashOrder) -> None:
+        self._makers, self._order = makers, order
+        self._scenes: dict[str, Any] = {}
+        self._truths: dict[str, SkinAppearance] = {}
+        self.with_oxygenation = False
+        self.first = self._scene(next(iter(makers)))
+
+    def _scene(self, state: str) -> Any:
+        if state not in self._scenes:
+            self._scenes[state] = self._makers[state]()
+        return self._scenes[state]
+
+    def prompt(self, world: Any, state: str) -> None:
+        """Put the face in a state in front of the camera."""
+        for left, scene in list(self._scenes.items()):
+            if scene is world.scene and left != state and self._order.target is None:
+                self._truths[left] = self._leave(left)
+        world.scene = self._scene(state)
+
+    def describe(self, state: str, session_hash: str) -> SkinAppearance:
+        """Return the ground truth of a state, for the session of this hash."""
+        found = self._truths.pop(state, None) or self._leave(state)
+        return dataclasses.replace(found, inputs={"session": session_hash})
+
+    def _leave(self, state: str) -> SkinAppearance:
+        """Return the ground truth of a state, and forget its scene."""
+        order, scene = self._order, self._scene(state)
+        truth = build_truth(
+            scene,
+            order.seed,
+            "",
+            state,
+            parameters=subject_records.truth_parameters(order.subject, "flash", order.progress),
+            with_oxygenation=self.with_oxygenation,
+        )
+        forget_cached(scene)
+        if scene is not self.first:
+            del self._scenes[state]
+        return truth
 
 
 def plan_capture(order: FlashOrder) -> tuple[Rig, Plan]:
@@ -118,7 +154,8 @@ def plan_capture(order: FlashOrder) -> tuple[Rig, Plan]:
     return rig, order.plan or DefaultPlan(**details).of(rig)
 
 
-def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
+def _scene_makers(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Callable[[], Any]]:
+    """Return a function per state that makes its scene."""
     seed = order.noise_seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     power = max(powers, default=0.0) or 1.0
@@ -126,12 +163,12 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
         state = "white" if order.target == "white" else ""
         target = targets.make_target(order.target)
         sensor = make_patch_sensor(rig) if order.renderer == "reference" else None
-        return {state: FlashScene(rig, target, seed=seed, power=power, sensor=sensor)}
+        return {state: partial(FlashScene, rig, target, seed=seed, power=power, sensor=sensor)}
     if order.renderer == "reference":
         given = select_attributes(
             order, "subject", "site", "seed", "noise_seed", "size", "progress"
         )
-        return {"neutral": reference.make_patch_scene(rig, **given)}
+        return {"neutral": partial(reference.make_patch_scene, rig, **given)}
     offset_mm = _stance_offset_mm(rig, order.nearer_mm)  # refuses, before the face is made
     subject = subject_file.load_subject(order.subject)
     texels = subject_records.choose_face_texels(rig.views[0].width_px)
@@ -139,7 +176,8 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     person = person.translate(offset_mm)
     person = person.translate(draw_head_position(order.session_seed))
     return {
-        state: FlashScene(
+        state: partial(
+            FlashScene,
             rig,
             person,
             state=state,

@@ -126,9 +126,16 @@ class FlashCamera:
                 raise RenderError(
                     f"{name}: rendering gave values that are not finite; report this scene"
                 )
-        diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
         reached = maps.pop("reached")
-        return FlashImage(diffuse, specular, white, maps, coverage, reached)
+        dark = np.broadcast_to(np.float32(0.0), (*coverage.shape, 3, 3))
+        return FlashImage(
+            maps.pop("diffuse", dark),
+            maps.pop("specular", dark[..., 0]),
+            maps.pop("shading", dark[..., 0]),
+            maps,
+            coverage,
+            reached,
+        )
 
     def blurred_maps(
         self, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
@@ -178,7 +185,7 @@ class FlashCamera:
             With these ground-truth maps only; no light.
         """
         textures = _dilate_textures(maps, subject)
-        return self._in_bands(surface.trace, lambda hits: _dark(hits) | _look_up(textures, hits))
+        return self._in_bands(surface.trace, lambda hits: _look_up(textures, hits))
 
     def _see_skin(
         self, surface: FlashSurface, hits: CameraHits, textures: ImageLayers
@@ -248,7 +255,10 @@ def _blur_through_lens(
     """Return the light and the coverage after lens blur, at the sensor's resolution."""
     toward = depth_before_focus(view, hits.position_mm)
     lens = LensImage(spread, hits.shape, hits.pixel, hits.first, hits.slot, toward)
-    blurred = {"diffuse": parts["diffuse"], "specular": parts["specular"]}
+    blurred: ImageLayers = {}
+    for name, part in parts.items():
+        if name in ("diffuse", "specular"):
+            blurred[name] = part
     blurred["reached"] = np.ones(hits.count, np.float32)
     return _split(lens.render(_joined(blurred)), blurred)
 
@@ -257,7 +267,7 @@ def _average(parts: ImageLayers, hits: CameraHits) -> tuple[ImageLayers, Float32
     """Average over pixels: light over the whole pixel, maps over its covered part."""
     coverage = hits.coverage()
     out = _split(hits.average(_joined(parts)), parts)
-    for name in _LIGHT_NAMES:
+    for name in out.keys() & set(_LIGHT_NAMES):
         out[name] *= coverage.reshape(*hits.shape, *[1] * (out[name].ndim - 2))
     if "normals" in out:
         normal = out["normals"]
