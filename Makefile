@@ -6,13 +6,17 @@ PYTEST := PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest
 # files in the order of tests/conftest.py, the longest first, not that of how many tests they have
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
+# make full RIG=flash: a rig at the size of its paper
+RIG := dome
+
 # make test-long PART=2/3: the second of three parts, each for a machine of its own
 PART := 1/1
 
-.PHONY: help setup browser firmware demo test test-long lint docs bench clean
+.PHONY: help setup browser firmware demo full test test-long lint docs bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, fuse, report (leaves ./demo)"
+	@echo "make full       one rig at the size of its paper, in ./full-RIG (RIG=dome, flash, gradient or probe; hours)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones (PART=2/3: the second of three parts)"
 	@echo "make lint       ruff, mypy and the import contracts"
@@ -38,6 +42,9 @@ firmware:
 
 demo: .venv/.demo
 	@$(SKINRIG) demo --out demo
+
+full: .venv/.ready
+	@.venv/bin/python tools/measure_scales.py run $(RIG) --out full-$(RIG)
 
 lint: .venv/.ready
 	@.venv/bin/ruff check .

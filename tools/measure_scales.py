@@ -110,8 +110,9 @@ def measure_command(words: Sequence[str], folder: Path, log: Path) -> dict[str, 
         except BaseException:
             process.terminate()
             raise
+    process.returncode = os.waitstatus_to_exitcode(status)
     return {
-        "exit": os.waitstatus_to_exitcode(status),
+        "exit": process.returncode,
         "seconds": time.perf_counter() - begun_s,
         "processor_s": used.ru_utime + used.ru_stime,
         "peak_mb": used.ru_maxrss * 1024e-6,
@@ -129,7 +130,8 @@ def run(rig: str, scale: str, seed: int, out: Path) -> dict[str, Any]:
     """Run the steps that are not recorded yet, and return the record."""
     out.mkdir(parents=True, exist_ok=True)
     written = out / RECORD_NAME
-    fresh: dict[str, Any] = {"rig": rig, "scale": scale, "seed": seed, "cores": os.cpu_count(), "steps": {}}
+    fresh: dict[str, Any] = {"rig": rig, "scale": scale, "seed": seed}
+    fresh |= {"cores": os.cpu_count(), "steps": {}}
     record = json.loads(written.read_text("utf-8")) if written.exists() else fresh
     asked = (rig, scale, seed)
     if (record["rig"], record["scale"], record["seed"]) != asked:
