@@ -16,9 +16,9 @@ from capture.session.errors import SessionDamage, SessionError
 
 KEY_VARIABLE = "SKINRIG_CONSENT_KEY"
 SEAL_FILE = "consent.seal"
-UNSEALED = "unsealed"
-NOT_CHECKED = f"sealed, not checked without {KEY_VARIABLE}"
-SEALED = "sealed with the key"
+UNSEALED_STATE = "unsealed"
+UNCHECKED_STATE = f"sealed, not checked without {KEY_VARIABLE}"
+SEALED_STATE = "sealed with the key"
 MIN_KEY_BYTES, MAX_KEY_BYTES = 32, 4096
 MAX_SEAL_BYTES = 256
 _PURPOSE = b"skinrig.consent-seal/1\n"
@@ -69,7 +69,7 @@ def make_seal(manifest: bytes, key: bytes) -> bytes:
 
 
 def check_seal(folder: Path, manifest: bytes) -> str:
-    """Return the state of a session's seal: `UNSEALED`, `NOT_CHECKED` or `SEALED`.
+    """Return the state of a session's seal: `UNSEALED_STATE`, `UNCHECKED_STATE` or `SEALED_STATE`.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def check_seal(folder: Path, manifest: bytes) -> str:
     key, path = read_key(), folder / SEAL_FILE
     if not os.path.lexists(path):
         if key is None:
-            return UNSEALED
+            return UNSEALED_STATE
         raise SessionError(
             "has no consent seal",
             where=str(folder),
@@ -90,10 +90,10 @@ def check_seal(folder: Path, manifest: bytes) -> str:
             code="SR-SES-016",
         )
     if key is None:
-        return NOT_CHECKED
+        return UNCHECKED_STATE
     found = read_file(path, limit=MAX_SEAL_BYTES, label="consent seal")
     if hmac.compare_digest(found, make_seal(manifest, key)):
-        return SEALED
+        return SEALED_STATE
     raise SessionDamage(
         "has another consent than was sealed",
         where=str(folder),

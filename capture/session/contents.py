@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.documents import Fault
-from capture.session.consent_seal import UNSEALED, check_seal
+from capture.session.consent_seal import UNSEALED_STATE, check_seal
 from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import (
@@ -32,7 +32,7 @@ class SessionContents:
 
     manifest: Manifest
     walk: JournalWalk
-    consent_seal: str = UNSEALED
+    consent_seal: str = UNSEALED_STATE
     """State of the consent's seal."""
 
     @property
@@ -104,7 +104,7 @@ def read_contents(path: Path, *, sealing: bool = False) -> SessionContents:
     where = path / MANIFEST_FILE
     data = read_file(where, limit=MAX_MANIFEST_BYTES, label="manifest", missing=no_session)
     manifest, seal = decode(data, where=str(where))
-    consent_seal = UNSEALED if sealing else check_seal(path, data)
+    consent_seal = UNSEALED_STATE if sealing else check_seal(path, data)
     where = path / JOURNAL_FILE
     journal = read_file(where, limit=MAX_JOURNAL_BYTES, label="journal")
     _require_folder(path / FRAMES_FOLDER)

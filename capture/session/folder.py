@@ -104,7 +104,7 @@ def seal_consent(path: str | Path, *, disk: Disk | None = None) -> SessionConten
             "the file of the lab's key",
             where=place,
             advice=f"Set {KEY_VARIABLE}.",
-            code="SR-SES-015",
+            code="SR-SES-018",
         )
     sealed = (place / SEAL_FILE).exists()
     contents = read_contents(place, sealing=not sealed)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 
-from capture.session.consent_seal import SEAL_FILE, UNSEALED
+from capture.session.consent_seal import SEAL_FILE, UNSEALED_STATE
 from capture.session.contents import (
     ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
@@ -41,7 +41,7 @@ class VerifyReport:
     """Bytes of those frames and of the intact attachments."""
     complete: bool = True
     """Whether the journal has a line for each file but one that an interruption may leave."""
-    consent_seal: str = UNSEALED
+    consent_seal: str = UNSEALED_STATE
     """Whether a key of the lab has sealed the consent, and whether the seal was checked."""
 
 

@@ -10,7 +10,7 @@ from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Disk, Session, SessionDiskError, SubjectRecord, verify
-from capture.session.consent_seal import KEY_VARIABLE, SEALED
+from capture.session.consent_seal import KEY_VARIABLE, SEALED_STATE
 from skinrig.capturing.acquisition import discard_unused_session
 from skinrig.console import Console
 from skinrig.soaking.host_life import HostKilled
@@ -97,7 +97,7 @@ def test_fault_while_sealing_leaves_sealed_session(tmp_path, fault, monkeypatch)
         path, acknowledged = tmp_path / f"s{number}", set()
         struck[strike(path, number, fault, acknowledged)] += 1
         finish(path, acknowledged)
-        assert verify(path).consent_seal == SEALED
+        assert verify(path).consent_seal == SEALED_STATE
     assert {"create", "write", "fsync", "rename", "fsync_dir"} <= set(struck)
 
 

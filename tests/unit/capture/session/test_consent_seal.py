@@ -11,7 +11,13 @@ from capture import raw
 from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session, SessionDamage, SessionError, SubjectRecord, reopen_copy, verify
-from capture.session.consent_seal import KEY_VARIABLE, NOT_CHECKED, SEAL_FILE, SEALED, UNSEALED
+from capture.session.consent_seal import (
+    KEY_VARIABLE,
+    SEAL_FILE,
+    SEALED_STATE,
+    UNCHECKED_STATE,
+    UNSEALED_STATE,
+)
 from capture.session.contents import read_contents
 from capture.session.journal import seal_line
 from capture.session.manifest import seal
@@ -75,7 +81,7 @@ def test_forged_chain_widens_an_unsealed_consent(make_session, tmp_path, capsys)
     assert export(path, tmp_path / "before") == 3
     forge(path)
     assert export(path, tmp_path / "after") == 0
-    assert verify(path).consent_seal == UNSEALED
+    assert verify(path).consent_seal == UNSEALED_STATE
     capsys.readouterr()
     assert main(["verify", str(path)]) == 0
     assert "consent unsealed" in capsys.readouterr().out
@@ -84,7 +90,7 @@ def test_forged_chain_widens_an_unsealed_consent(make_session, tmp_path, capsys)
 @pytest.mark.parametrize("form", ["mhl", "frames", "event-model"])
 def test_forged_chain_of_sealed_consent_is_refused(key, make_session, tmp_path, capsys, form):
     path = make_session()
-    assert verify(path).consent_seal == SEALED
+    assert verify(path).consent_seal == SEALED_STATE
     forge(path)
     found = verify(path)
     assert not found.ok
@@ -118,7 +124,7 @@ def test_sealed_consent_without_key_is_not_checked(key, make_session, monkeypatc
     path = make_session()
     monkeypatch.delenv(KEY_VARIABLE)
     assert verify(path).ok
-    assert verify(path).consent_seal == NOT_CHECKED
+    assert verify(path).consent_seal == UNCHECKED_STATE
     assert main(["verify", str(path)]) == 0
     assert f"not checked without {KEY_VARIABLE}" in capsys.readouterr().out
     forge(path)
@@ -142,10 +148,10 @@ def test_copies_of_sealed_session_are_sealed(key, make_session, tmp_path):
     path = make_session()
     copy, _ = reopen_copy(path, tmp_path / "copy")
     copy.release()
-    assert verify(tmp_path / "copy").consent_seal == SEALED
+    assert verify(tmp_path / "copy").consent_seal == SEALED_STATE
     argv = ["export", str(path), "--to", "mhl", "--use", "research"]
     assert main([*argv, "--out", str(tmp_path / "out")]) == 0
-    assert verify(tmp_path / "out").consent_seal == SEALED
+    assert verify(tmp_path / "out").consent_seal == SEALED_STATE
     shutil.rmtree(path / "frames")
     assert not verify(path).ok
 
@@ -160,7 +166,7 @@ def test_command_seals_older_session_once(make_session, key, monkeypatch, capsys
     for _ in range(2):
         assert main(["session", "seal", str(path)]) == 0
         assert "P042: research" in capsys.readouterr().out
-    assert verify(path).consent_seal == SEALED
+    assert verify(path).consent_seal == SEALED_STATE
     forge(path)
     assert main(["session", "seal", str(path)]) == 3
     assert not verify(path).ok
