@@ -150,7 +150,7 @@ def test_dead_lights_have_no_strength_and_no_weight(rng):
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
 
 
-def test_weak_lights_have_their_strength_and_move_no_other(rng):
+def test_weak_lights_are_measured_and_move_no_other(rng):
     """LEDs that emit 90 to 20 % of the requested light, which no controller measures."""
     readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.2)
     whole = fit_polarizers(readings, rates, variance, good, GLASS)
