@@ -1,11 +1,12 @@
 """Mutate functions of a group of modules, run the tests that reach them, and print the score.
 
 One operator, number or statement is changed at a time, in a child of a process that has loaded the
-tests. The mutants are drawn by a seed. Outcomes go to tools/mutants.csv as they are found, and
-another run continues there; a mutant of a changed line runs again. Survivors keep the reason in
-the column `why` that a person has written.
+tests. The mutants are drawn by a seed, without those that other seeds have
+drawn. Outcomes go to tools/mutants.csv as they are found, and another run continues there; a mutant
+of a changed line runs again. Survivors keep the reason in the column `why` that a person has
+written.
 
-python tools/measure_mutants.py --groups session,lines,rules --count 60 [--budget 600]
+python tools/measure_mutants.py --groups session,lines,rules --count 60 --seed 4 [--budget 600]
 """
 
 import argparse
@@ -32,12 +33,20 @@ sys.path.insert(0, str(ROOT / "tests"))
 from fixtures.planted import planted  # noqa: E402
 
 TABLE = ROOT / "tools/mutants.csv"
-COLUMNS = ("group", "file", "line", "column", "change", "hash", "outcome", "why")
+COLUMNS = ("group", "file", "line", "column", "change", "hash", "seed", "outcome", "why")
 GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "session": (
         tuple(
             f"capture/session/{name}.py"
-            for name in ("disk", "folder", "journal", "reopening", "store", "verification")
+            for name in (
+                "consent_seal",
+                "disk",
+                "folder",
+                "journal",
+                "reopening",
+                "store",
+                "verification",
+            )
         ),
         ("tests/unit/capture/session", "tests/faults/test_damage.py"),
     ),
@@ -295,21 +304,25 @@ def main() -> None:
         judge_group(group, order.count, order.seed, order.budget)
     for group in GROUPS:
         rows = [row for row in read_table() if row["group"] == group]
-        judged = [row for row in rows if row["outcome"] != "no function"]
-        if judged:
-            found = sum(row["outcome"] in ("killed", "late") for row in judged)
-            low, high = find_interval(found, len(judged))
-            why = sum(bool(row["why"]) for row in judged)
-            text = f"{group}: {found} of {len(judged)} killed, {100 * found / len(judged):.0f} %"
-            print(f"{text} ({100 * low:.0f} to {100 * high:.0f}), {why} survivors explained")
+        for seed in sorted({row["seed"] for row in rows}):
+            print_score(f"{group}, seed {seed}", [row for row in rows if row["seed"] == seed])
+
+
+def print_score(title: str, rows: list[dict[str, str]]) -> None:
+    """Print how many mutants of some rows are killed."""
+    judged = [row for row in rows if row["outcome"] != "no function"]
+    if judged:
+        found = sum(row["outcome"] in ("killed", "late") for row in judged)
+        low, high = find_interval(found, len(judged))
+        why = sum(bool(row["why"]) for row in judged)
+        text = f"{title}: {found} of {len(judged)} killed, {100 * found / len(judged):.0f} %"
+        print(f"{text} ({100 * low:.0f} to {100 * high:.0f}), {why} survivors explained")
 
 
 def judge_group(group: str, count: int, seed: int, budget_s: float) -> None:
-    """Judge the drawn mutants of a group that the table has not."""
+    """Judge the drawn mutants of a group that the table lacks, and those marked "again"."""
     files, tests = GROUPS[group]
     mutants = [mutant for file in files for mutant in list_mutants(group, file)]
-    chosen = np.random.default_rng(seed).permutation(len(mutants))[:count]
-    drawn = [mutants[number] for number in sorted(chosen.tolist())]
     rows = read_table()
     current = {mutant.key for mutant in mutants}
     known = {
@@ -318,8 +331,15 @@ def judge_group(group: str, count: int, seed: int, budget_s: float) -> None:
         if row["group"] != group or (row["file"], row["hash"]) in current
     }
     begun_s = time.monotonic()
-    to_do = [one for one in drawn if one.key not in known or known[one.key]["outcome"] == "again"]
-    print(f"{group}: {len(mutants)} mutants, {len(drawn)} drawn, {len(to_do)} to judge", flush=True)
+    order = np.random.default_rng(seed).permutation(len(mutants)).tolist()
+    others = {key for key, row in known.items() if row["seed"] != str(seed)}
+    chosen = [number for number in order if mutants[number].key not in others][:count]
+    again = {key for key, row in known.items() if row["outcome"] == "again"}
+    to_do = [mutants[number] for number in sorted(chosen) if mutants[number].key not in known]
+    to_do += [mutant for mutant in mutants if mutant.key in again]
+    print(
+        f"{group}: {len(mutants)} mutants, {len(chosen)} drawn, {len(to_do)} to judge", flush=True
+    )
     if not to_do:
         return
     reach = Reach(files)
@@ -335,9 +355,13 @@ def judge_group(group: str, count: int, seed: int, budget_s: float) -> None:
             break
         outcome = judge(mutant, reach)
         row = {name: str(getattr(mutant, name)) for name in COLUMNS[:6]}
-        row |= {"outcome": outcome, "why": known.get(mutant.key, {}).get("why", "")}
+        before = known.get(mutant.key, {"seed": str(seed), "why": ""})
+        row |= {"seed": before["seed"], "outcome": outcome, "why": before["why"]}
         known[mutant.key] = row
-        write_table(sorted(known.values(), key=lambda one: (one["file"], int(one["line"]))))
+        # others may have written since: rows of this group replace those of the table
+        own = [one for one in known.values() if one["group"] == group]
+        foreign = [one for one in read_table() if one["group"] != group]
+        write_table(sorted(own + foreign, key=lambda one: (one["file"], int(one["line"]))))
         print(f"  {outcome:11} {mutant.file}:{mutant.line} {mutant.change}", flush=True)
 
 

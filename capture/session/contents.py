@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.documents import Fault
+from capture.session.consent_seal import UNSEALED_STATE, check_seal
 from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import (
@@ -31,6 +32,8 @@ class SessionContents:
 
     manifest: Manifest
     walk: JournalWalk
+    consent_seal: str = UNSEALED_STATE
+    """State of the consent's seal."""
 
     @property
     def frame_lines(self) -> tuple[FrameLine, ...]:
@@ -59,15 +62,22 @@ class SessionContents:
         return last if isinstance(last, CloseLine) else None
 
 
-def read_contents(path: Path) -> SessionContents:
+def read_contents(path: Path, *, sealing: bool = False) -> SessionContents:
     """Return manifest and journal of the session at ``path``; damage of the journal is recorded.
+
+    Parameters
+    ----------
+    path : Path
+        The session's folder.
+    sealing : bool
+        Whether a session without a consent seal is accepted although a key is set.
 
     Raises
     ------
     SessionError
-        When the folder is not a session, or its schema is unknown.
+        When the folder is not a session, its schema is unknown, or its consent seal is missing.
     SessionDamage
-        When session.json differs from what was written, or the journal is missing.
+        When session.json differs from what was written or sealed, or the journal is missing.
     """
 
     def no_session() -> SessionError:
@@ -94,6 +104,7 @@ def read_contents(path: Path) -> SessionContents:
     where = path / MANIFEST_FILE
     data = read_file(where, limit=MAX_MANIFEST_BYTES, label="manifest", missing=no_session)
     manifest, seal = decode(data, where=str(where))
+    consent_seal = UNSEALED_STATE if sealing else check_seal(path, data)
     where = path / JOURNAL_FILE
     journal = read_file(where, limit=MAX_JOURNAL_BYTES, label="journal")
     _require_folder(path / FRAMES_FOLDER)
@@ -102,7 +113,7 @@ def read_contents(path: Path) -> SessionContents:
     walked = walk_journal(journal, seal=seal, where=str(where))
     if walked.damage is None:
         walked = _check_against_plan(walked, manifest, str(where))
-    return SessionContents(manifest, walked)
+    return SessionContents(manifest, walked, consent_seal)
 
 
 def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> JournalWalk:

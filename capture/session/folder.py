@@ -6,17 +6,20 @@ from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
+from capture.session.consent_seal import KEY_VARIABLE, SEAL_FILE, make_seal, read_key
 from capture.session.contents import (
     FRAMES_FOLDER,
     JOURNAL_FILE,
     MANIFEST_FILE,
+    MAX_MANIFEST_BYTES,
     ORPHANS_FOLDER,
     SessionContents,
     find_lost_lines,
     list_files,
+    read_contents,
     unlisted_files,
 )
-from capture.session.disk import Disk
+from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
 _log = logging.getLogger(__name__)
@@ -63,6 +66,7 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
         Unless the folder is new, empty, or left over from an interrupted creation.
     """
     require_free(path)
+    read_key()  # an unfit key is refused before a folder is made
     with DiskErrors(path):
         for folder in (path, path / FRAMES_FOLDER, path / ORPHANS_FOLDER):
             if not folder.is_dir():
@@ -72,8 +76,51 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
         write_manifest(disk, path, manifest)
 
 
+def write_consent_seal(disk: Disk, path: Path, manifest: bytes) -> None:
+    """Write the seal of a manifest where a key is set; the caller flushes its name."""
+    if (key := read_key()) is None:
+        return
+    if (path / SEAL_FILE).exists():  # left over from an interrupted creation
+        disk.remove(path / SEAL_FILE)
+    write_new(disk, path / SEAL_FILE, make_seal(manifest, key))
+
+
+def seal_consent(path: str | Path, *, disk: Disk | None = None) -> SessionContents:
+    """Seal the consent of a session that has no seal yet, and return its contents.
+
+    Raises
+    ------
+    SessionError
+        Without a key, or when the folder is not a session.
+    SessionDamage
+        When the session is damaged, or has another seal.
+    """
+    disk, place = disk or Disk(), Path(path)
+    if read_key() is None:
+        raise SessionError.at(
+            "cannot be sealed",
+            KEY_VARIABLE,
+            "not set",
+            "the file of the lab's key",
+            where=place,
+            advice=f"Set {KEY_VARIABLE}.",
+            code="SR-SES-018",
+        )
+    sealed = (place / SEAL_FILE).exists()
+    contents = read_contents(place, sealing=not sealed)
+    if contents.walk.damage is not None:
+        raise contents.walk.damage
+    if not sealed:
+        manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, label="manifest")
+        with DiskErrors(place):
+            write_consent_seal(disk, place, manifest)
+            disk.fsync_dir(place)
+    return read_contents(place)
+
+
 def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
     """Write the manifest under its name, last: from then on the session exists."""
+    write_consent_seal(disk, path, manifest)
     part = path / f"{MANIFEST_FILE}.part"
     if part.exists():
         disk.remove(part)
@@ -93,7 +140,7 @@ def require_free(path: Path) -> None:
         raise _occupied_error(path, "parent", "no such folder", "an existing folder")
     if not path.exists():
         return
-    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part"}
+    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part", SEAL_FILE}
     found = {entry.name for entry in os.scandir(path)}
     filled = any(
         any((path / folder).iterdir())

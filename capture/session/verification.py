@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 
+from capture.session.consent_seal import SEAL_FILE, UNSEALED_STATE
 from capture.session.contents import (
     ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
@@ -21,7 +22,7 @@ from capture.session.journal import FrameLine
 from capture.session.view import check_file
 
 _KNOWN_NAMES = {MANIFEST_FILE, JOURNAL_FILE, FRAMES_FOLDER, ATTACHMENTS_FOLDER, ORPHANS_FOLDER}
-_KNOWN_NAMES |= {"index.sqlite", "ascmhl"}
+_KNOWN_NAMES |= {"index.sqlite", "ascmhl", SEAL_FILE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,8 @@ class VerifyReport:
     """Bytes of those frames and of the intact attachments."""
     complete: bool = True
     """Whether the journal has a line for each file but one that an interruption may leave."""
+    consent_seal: str = UNSEALED_STATE
+    """Whether a key of the lab has sealed the consent, and whether the seal was checked."""
 
 
 def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
@@ -66,7 +69,8 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     A flipped bit anywhere in a committed file is detected: session.json carries a seal over all its
     bytes, the journal a SHA-256 chain from that seal, and the journal an XXH3-128 of every frame
     and attachment. This protects against accidents; against a forger only a copy of the last hash
-    kept elsewhere helps (``Session.content_hash``).
+    kept elsewhere helps (``Session.content_hash``). A key of the lab protects the consent alone
+    (`capture.session.consent_seal`).
     """
     place = Path(path)
     problems: list[str] = []
@@ -96,7 +100,10 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
         problems.append(str(lost))
     warnings.extend(_state(place, contents))
     warnings.extend(_consent(contents, today or datetime.now(UTC).date()))
-    return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size, lost is None)
+    return VerifyReport(
+        *(not problems, tuple(problems), tuple(warnings), frames, size, lost is None),
+        contents.consent_seal,
+    )
 
 
 def _state(place: Path, contents: SessionContents) -> list[str]:

@@ -17,6 +17,7 @@ from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, SessionDiskError, SubjectRecord
+from capture.session.consent_seal import SEAL_FILE
 from skinrig.capturing.addresses import open_box, open_with_retry, require_addresses
 from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
@@ -278,6 +279,7 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
     with contextlib.suppress(OSError):
         for name in ("session.json", "journal.jsonl"):
             (path / name).unlink()
+        (path / SEAL_FILE).unlink(missing_ok=True)
         for part in (path / "frames").glob("*.part"):
             part.unlink()
         (path / "frames").rmdir()

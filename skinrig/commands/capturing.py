@@ -329,12 +329,40 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     console.print_line(
         f"{session}: {state}, {format_count(found.frames, 'frame')}, {found.bytes / 1e6:.1f} MB"
     )
+    if found.ok:
+        console.print_line(f"{session}: consent {found.consent_seal}")
     figures = select_attributes(
-        *(found, "ok", "complete", "problems", "warnings", "frames", "bytes")
+        *(found, "ok", "complete", "problems", "warnings", "frames", "bytes", "consent_seal")
     )
     console.print_document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.EXIT_BAD_INPUT)
+
+
+@session_app.command("seal", cls=Command)
+@command
+def seal(session: Path, /, json: options.Json = False) -> None:
+    """Seal the consent of a session with the lab's key, so that no one without it can widen it.
+
+    The variable SKINRIG_CONSENT_KEY names the file of the key. Where it is set, new sessions are
+    sealed as they are made. Compare the printed consent with the signed form.
+
+    Example: skinrig session seal session
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder.
+    """
+    from capture.session.folder import seal_consent
+    from skinrig.consent import format_consent
+
+    console = Console(json)
+    found = seal_consent(session)
+    (line,) = format_consent([found.manifest.to_json()["subject"]])
+    console.print_line(f"{session}: consent {found.consent_seal}: {line}")
+    figures = {"path": str(session), "consent_seal": found.consent_seal, "consent": line}
+    console.print_document("skinrig.session.seal/1", figures)
 
 
 @session_app.command("anonymize", cls=Command)

@@ -18,6 +18,8 @@ HOST_FAULTS: Final = (
 MAX_STRUCK_LINE = 250
 MAX_STRUCK_OPERATION = 60
 MAX_CLOCK_JUMP_S = 7200.0
+WEAK_LED_SHARE = 0.3
+"""Days of a rig with an LED that emits less than requested, relative to all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,4 +95,8 @@ def draw_rig_faults(rng: np.random.Generator, lights: int) -> Faults:
     }
     shares = {"interlock_after": 0.03, "led_dead": 0.1}
     drawn |= {name: v for name, v in rare.items() if rng.random() < shares.get(name, 0.15)}
+    # chance of its own, so that the other faults of a seed stay what they were
+    own = rng.spawn(1)[0]
+    if own.random() < WEAK_LED_SHARE:
+        drawn["led_weak"] = f"{own.integers(lights)}={own.integers(2, 10) / 10}"
     return Faults(**drawn)

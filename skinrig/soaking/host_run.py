@@ -260,13 +260,14 @@ class HostRun:
         )
 
     def _try_second_client(self) -> None:
-        """Open a controller that this host uses; it must be refused."""
-        url = f"sim://{self.witness.box}?world={self.world_name}"
-        try:
-            Port(url, clock=self.world.clock, first_seq=1).close()
-        except PortBusy:
-            return
-        raise SecondClientAdmitted(f"{url}: opened by two hosts")
+        """Open each controller that this host uses; it must be refused."""
+        for kind in self.witness.rig.boxes:
+            url = f"sim://{kind}?world={self.world_name}"
+            try:
+                Port(url, clock=self.world.clock, first_seq=1).close()
+            except PortBusy:
+                continue
+            raise SecondClientAdmitted(f"{url}: opened by two hosts")
 
 
 class SecondClientAdmitted(Exception):

@@ -353,7 +353,9 @@ class SoakedSession:
             serial = self._witness.rig.view(record.camera).serial
             same = record.actual["serial"] == serial
             require(same, "no frame of another camera", record.step_id)
-            deviation = self._witness.find_deviation(record.step, frame.cfa, record.actual)
+            deviation = self._witness.find_deviation(
+                record.step, frame.cfa, record.actual, self._world.faults.weak_leds
+            )
             if deviation:
                 yield f"{record.step_id}: {deviation}"
         self._outcome.shots = len(found)

@@ -33,6 +33,9 @@ Row = tuple[int, int, int]
 """Description of a light, or of what the rig holds: three numbers of a pixel row."""
 
 
+NO_WEAK_LEDS: Final[Mapping[int, float]] = {}
+
+
 class WitnessRig(ABC):
     """One rig, its plans, and the pixels of its light.
 
@@ -83,8 +86,16 @@ class WitnessRig(ABC):
             image[2 : 2 + len(rows), :3] = rows
         return image
 
+    def weaken(self, row: Row, weak: Mapping[int, float]) -> Row:
+        """Return the row of a light whose weak LEDs emit these fractions, by number."""
+        return row
+
     def find_deviation(
-        self, step: Step, cfa: NDArray[np.uint16], actual: Mapping[str, Value]
+        self,
+        step: Step,
+        cfa: NDArray[np.uint16],
+        actual: Mapping[str, Value],
+        weak: Mapping[int, float] = NO_WEAK_LEDS,
     ) -> str:
         """Return how the light of a frame differs from what its step requests; empty: not.
 
@@ -96,6 +107,9 @@ class WitnessRig(ABC):
             Its pixels, shape (H, W).
         actual
             Its entry in the journal.
+        weak
+            Fraction that each weak LED emits, by number: no controller measures light, so that
+            its frames are filed as requested.
         """
         count = min(int(cfa[0, 0]), MAX_ROWS)
         seen = [_row(row) for row in cfa[2 : 2 + count]]
@@ -104,6 +118,7 @@ class WitnessRig(ABC):
             return f"exposure {actual['exposure_s']} s, expected {step.settings['exposure_s']} s"
         if dead := str(actual.get("dead_lights", "")):
             wanted = self._without_dead(step, dead)
+        wanted = sorted(self.weaken(row, weak) for row in wanted)
         if not self._same(seen, wanted):
             return f"light {seen}, expected {wanted}"
         held, wanted_hold = _row(cfa[1]), self.expect_hold(step)
@@ -191,6 +206,10 @@ class DomeWitness(WitnessRig):
         level = round(1e3 * float(step.settings.get("level", 1.0)))
         return [(numbers[name], level, 1) for name in step_lights(step)]
 
+    def weaken(self, row: Row, weak: Mapping[int, float]) -> Row:
+        """Return the row of a light whose weak LEDs emit these fractions, by number."""
+        return row[0], round(row[1] * weak.get(row[0] - 1, 1.0)), row[2]
+
 
 class GradientWitness(WitnessRig):
     """A ball of black glass under patterns, without a caliper."""
@@ -274,6 +293,10 @@ class ProbeWitness(WitnessRig):
         fiber = step.settings.get("fiber")
         level = round(1e3 * float(step.settings.get("level", 1.0)))
         return [(level, 0 if fiber is None else 1 + int(fiber), round(1e3))]
+
+    def weaken(self, row: Row, weak: Mapping[int, float]) -> Row:
+        """Return the row of the only LED, which may emit a fraction."""
+        return round(row[0] * weak.get(0, 1.0)), row[1], row[2]
 
     def _same(self, seen: list[Row], wanted: list[Row]) -> bool:
         tolerance = 1e3 * SHUTTER_TOLERANCE

@@ -20,14 +20,18 @@ ONE_THREAD: Final = dict.fromkeys(
     ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
 """Environment of a worker process: N workers use N threads."""
-FEW_SAMPLES: Final = {
+LOCAL_SETTINGS: Final = {
+    "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.admin.system-monitor.gil.enabled": False,
     "distributed.admin.tick.interval": "500ms",
     "distributed.worker.memory.monitor-interval": "500ms",
 }
-"""Settings of local processes: Dask samples stacks, memory and event loops less often."""
+"""Settings of local processes: Dask waits an hour for a worker to be started again, and samples
+stacks, memory and event loops less often. On a busy machine a start takes more than Dask's 15 s,
+after which it gives the worker up, and the command waits for ever.
+"""
 CONNECT_TIMEOUT_S: Final = 10
 _LOCAL: Final = re.compile(r"local:([1-9]\d{0,3})")
 _REMOTE: Final = re.compile(r"(tcp|tls)://\S+:\d+")
@@ -102,7 +106,7 @@ def open_executor(text: str) -> Iterator[Executor | None]:
     local = _LOCAL.fullmatch(text)
     where: Any = text
     if local is not None:
-        dask.config.set(FEW_SAMPLES)  # for this process: it has the scheduler, and ends with it
+        dask.config.set(LOCAL_SETTINGS)  # for this process: it has the scheduler, and ends with it
         where = distributed.LocalCluster(
             n_workers=int(local[1]),
             threads_per_worker=1,

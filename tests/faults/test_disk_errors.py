@@ -10,6 +10,7 @@ from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Disk, Session, SessionDiskError, SubjectRecord, verify
+from capture.session.consent_seal import KEY_VARIABLE, SEALED_STATE
 from skinrig.capturing.acquisition import discard_unused_session
 from skinrig.console import Console
 from skinrig.soaking.host_life import HostKilled
@@ -82,6 +83,22 @@ def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
     print(f"{fault}: {struck.total()} operations: {dict(struck)}")
     assert struck.total() >= 30
     assert {"create", "write", "fsync", "fdatasync", "rename", "fsync_dir"} <= set(struck)
+
+
+@pytest.mark.parametrize("fault", ["ENOSPC", "kill"])
+def test_fault_while_sealing_leaves_sealed_session(tmp_path, fault, monkeypatch):
+    """Each operation that creates a session whose consent a key seals."""
+    key = tmp_path / "consent.key"
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
+    struck = Counter()
+    for number in range(1, 22):
+        path, acknowledged = tmp_path / f"s{number}", set()
+        struck[strike(path, number, fault, acknowledged)] += 1
+        finish(path, acknowledged)
+        assert verify(path).consent_seal == SEALED_STATE
+    assert {"create", "write", "fsync", "rename", "fsync_dir"} <= set(struck)
 
 
 @pytest.mark.parametrize("fault", ["ENOSPC", "kill"])

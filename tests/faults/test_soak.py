@@ -3,13 +3,19 @@
 import json
 import os
 
+import numpy as np
 import pytest
 from fixtures.planted import BUGS, mutate, planted
 from fixtures.product_code import ROOT, text_of
 
+from rigsim.world import World
+from rigsim.world.line_faults import LineFaults
 from skinrig.cli import main
-from skinrig.soaking import soak
+from skinrig.soaking import host_run, soak, soaked_session
+from skinrig.soaking.fault_draw import HostFault
 from skinrig.soaking.soak import run_soak
+from skinrig.soaking.soaked_session import SoakedSession
+from skinrig.soaking.witnesses import WITNESS_RIGS, DomeWitness, WitnessRig
 
 SEED = 100
 BUGS_VARIABLE = "SOAK_BUGS"
@@ -43,6 +49,40 @@ def test_soak_finds_planted_bug_and_names_replay(capsys):
     document = json.loads(capsys.readouterr().out)
     assert "dark within lease + 10 ms" in document["failure"]
     assert " ".join(["skinrig", *argv[:-1]]) in document["failure"]
+
+
+@pytest.mark.parametrize("name", WITNESS_RIGS)
+def test_second_client_is_refused_in_every_rig(name, tmp_path, monkeypatch):
+    """Each controller of the rig; the first host completes its session."""
+    fault = HostFault("second client", 1)
+    monkeypatch.setattr(soaked_session, "draw_host_fault", lambda rng: fault)
+    witness, tried = WITNESS_RIGS[name], []
+
+    class NotedPort(host_run.Port):
+        def __init__(self, url, **words):
+            tried.append(url)
+            super().__init__(url, **words)
+
+    monkeypatch.setattr(host_run, "Port", NotedPort)
+    world = World(witness.rig, seed=3, scene=witness)
+    rng, words = np.random.default_rng(3), {"label": "d0s0", "day": 0}
+    monkeypatch.setattr(LineFaults, "pass_on", lambda self, way, line: [(0.0, line)])
+    registered = world.register(f"second-{name}")
+    soaked = SoakedSession(witness, world, registered, tmp_path, rng=rng, **words)
+    outcome = soaked.run()
+    assert outcome.faults["second client"] == outcome.runs == 1
+    assert outcome.codes == {0: 1}
+    assert {url.split("?")[0] for url in tried} == {f"sim://{kind}" for kind in witness.rig.boxes}
+
+
+@pytest.mark.long
+def test_weak_led_is_filed_and_would_be_noticed(monkeypatch):
+    """No controller measures light: frames of a weak LED have less than their step requests."""
+    seed, day = 100, 2
+    assert run_soak(seed, hours=24, first_day=day).failure == ""
+    monkeypatch.setattr(DomeWitness, "weaken", WitnessRig.weaken)
+    failure = run_soak(seed, hours=24, first_day=day).failure
+    assert "no frame is filed under a wrong light" in failure
 
 
 @pytest.mark.parametrize("option", [("--hours", "-1"), ("--hours", "nan"), ("--budget", "0")])

@@ -6,6 +6,7 @@ Mutations are drawn by a seed. The attacks of the table are what an enemy would 
 import contextlib
 import dataclasses
 import gc
+import importlib.util
 import io
 import json
 import tracemalloc
@@ -15,6 +16,7 @@ import zipfile
 import numpy as np
 import pytest
 from fixtures.mutations import mutate
+from fixtures.product_code import ROOT
 from fixtures.strangers_files import FORMATS
 
 from skinrig import errors
@@ -185,6 +187,15 @@ def test_link_out_of_the_folder_is_not_followed(tmp_path):
     path.write_bytes(edited(lambda d: d["buffers"][0].update(uri="data.bin"))(path.read_bytes()))
     with pytest.raises(ValueError, match="expected a file next to it"):
         form.read(path)
+
+
+def test_fuzzer_has_every_reader():
+    path = ROOT / "tools/fuzz_readers.py"
+    spec = importlib.util.spec_from_file_location("fuzz_readers", path)
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    assert set(tool.READERS) == set(FORMATS)
+    assert set(tool.sum_runs()[0]) <= set(FORMATS)
 
 
 def test_unclear_outcomes_are_found(tmp_path):

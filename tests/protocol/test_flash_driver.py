@@ -239,6 +239,8 @@ def liar(rig):
         ("trigger_cameras", ("d",), "e,5"),
         ("trigger_cameras", ("d",), "d,x"),
         ("errors", (), "none"),
+        ("errors", (), "5"),
+        ("errors", (), 'x,"text"'),
         ("status", (), "armed"),
         ("hello", (), "{}*0000"),
         ("hello", (), "[]*0A50"),

@@ -203,6 +203,13 @@ def test_events_are_kept_and_number_gaps_counted(open_port):
     assert port.statistics.lost_events == 2
 
 
+def test_answers_while_listening_count_as_stale(open_port):
+    port = open_port()
+    port.line.arrived += say(3, "late") + encode(Event(0, 0x9F3A, "WDOG:TRIP", "300"))
+    assert len(port.listen(0.1)) == 1
+    assert port.statistics.stale == 1
+
+
 FAILURES = [
     serial.SerialException("device reports readiness to read but returned no data"),
     OSError(errno.EIO, "Input/output error"),
@@ -275,6 +282,18 @@ def test_a_port_that_another_program_holds_is_busy(monkeypatch):
         Port("/dev/box")
 
 
+def test_port_without_permission_is_not_called_busy(monkeypatch):
+    """Advice to end another program would send the person to the wrong place."""
+
+    def forbidden(url, **_):
+        raise serial.SerialException(errno.EACCES, "could not open port: permission denied")
+
+    monkeypatch.setattr(serial, "serial_for_url", forbidden)
+    with pytest.raises(LinkLost, match="cannot open /dev/box: Permission denied") as caught:
+        Port("/dev/box")
+    assert not isinstance(caught.value, PortBusy)
+
+
 @pytest.mark.parametrize("url", ["nonsense://box", "sim://flash?dorp=1", "sim://toaster"])
 def test_unknown_port_url_is_reported_with_suggestion(url):
     with pytest.raises(PortUrlError, match=r"nonsense|did you mean drop|expected 'flash'|flash"):
@@ -324,6 +343,16 @@ def test_first_numbers_differ_from_run_to_run(monkeypatch):
 def test_settings_that_make_no_sense_are_refused(field, value):
     with pytest.raises(ValueError, match=field):
         Port("/dev/box", **{field: value})
+
+
+def test_port_without_retries_asks_once(monkeypatch):
+    line = Line([(ask(7, "STAT?"), b"")])
+    monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: line)
+    port = Port("/dev/box", clock=StillClock(), first_seq=7, retries=0)
+    port.boot = 0x9F3A
+    with pytest.raises(PortTimeout):
+        port.ask("STAT?")
+    assert port.statistics.frames == 1
 
 
 def greet(seq):

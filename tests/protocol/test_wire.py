@@ -185,3 +185,12 @@ def test_reply_code_outside_four_digits_is_refused(code):
 def test_event_name_is_upper_case(name):
     with pytest.raises(ValueError, match="upper-case words"):
         Event(1, 0, name)
+
+
+def test_half_of_all_numbers_is_behind():
+    """2^31 numbers are behind the latest one, and as many are not, itself among them."""
+    for latest in (0, 5, 2**31, 2**32 - 1):
+        for ahead in (0, 1, 2**31 - 1):
+            assert not wire.is_behind((latest + ahead) % 2**32, latest)
+        for behind in (1, 2**31 - 1, 2**31):
+            assert wire.is_behind((latest - behind) % 2**32, latest)

@@ -10,6 +10,7 @@ import time
 from contextlib import contextmanager
 
 import numpy as np
+import psutil
 import pytest
 import tifffile
 from fixtures.faulty_stacks import dome, render
@@ -208,6 +209,44 @@ def test_sessions_on_workers_give_same_maps(stacks, tmp_path):
     assert len(files) > 4
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def kill_workers_of(command, out):
+    """Kill the worker processes of a command once a session has begun; return how many."""
+    end_s = time.monotonic() + 3.0 * START_S  # of the command, its workers, and their libraries
+    while not list(out.glob(".*.work")):
+        assert time.monotonic() < end_s, "no session has begun"
+        assert command.poll() is None, "the command ended before a session had begun"
+        time.sleep(0.002)
+    complete = len(list(out.glob("*/appearance.json")))
+    children = psutil.Process(command.pid).children(recursive=True)
+    workers = [one for one in children if "spawn_main" in " ".join(one.cmdline())]
+    for one in workers:
+        one.kill()
+    return len(workers), complete
+
+
+@pytest.mark.timeout(900)
+def test_killed_workers_of_reconstruction_change_nothing(stacks, tmp_path):
+    """Nannies restart the workers, which take the sessions up; later commands reuse the maps."""
+    subprocess.run(
+        [sys.executable, "-m", "skinrig", *arguments(stacks, tmp_path / "a", "threads")], check=True
+    )
+    out = tmp_path / "b"
+    out.mkdir()
+    words = [sys.executable, "-m", "skinrig", *arguments(stacks, out, "local:2")]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as command:
+        killed, complete = kill_workers_of(command, out)
+        _, errors = command.communicate(timeout=400)
+    assert killed == 2
+    assert complete < len(stacks)
+    assert command.returncode == 0, errors.decode()
+    assert b"Traceback" not in errors
+    files = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*")]
+    assert len(files) > 4
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (out / file).read_bytes(), file
+    assert not list(out.glob(".*"))
 
 
 def test_error_of_worker_is_that_of_serial_run(stacks, tmp_path, capsys):

@@ -9,6 +9,7 @@ from typing import Any
 
 from capture.plan import Value
 from capture.session import FrameRecord, Session
+from capture.session.consent_seal import SEAL_FILE
 from capture.session.contents import read_undamaged_contents
 from capture.session.view import check_file
 from reconstruction.pipeline.inputs import Inputs
@@ -34,8 +35,9 @@ def write_session_document(
 
 def write_session(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy all files of a session."""
-    for name in ("session.json", "journal.jsonl"):
-        shutil.copyfile(session.path / name, out / name)
+    for name in ("session.json", "journal.jsonl", SEAL_FILE):
+        if (session.path / name).is_file():
+            shutil.copyfile(session.path / name, out / name)
     for folder in ("frames", "attachments"):
         if (session.path / folder).is_dir():
             (out / folder).mkdir()

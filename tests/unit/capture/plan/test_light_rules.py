@@ -13,7 +13,9 @@ from capture.plan.eye_light import eye_irradiance, radiant_intensity
 from capture.plan.flicker import (
     DARK_PADDING_S,
     EYE_SAMPLE_S,
+    MIN_RMS_DURATION_S,
     FlickerReport,
+    average_over_flicker_fusion,
     band_rms,
     count_flashes,
     eye_signal,
@@ -158,6 +160,19 @@ def test_mean_light_of_plan_gives_its_exposure():
     assert report.mean_w_m2 * report.seconds == pytest.approx(exposure, rel=5e-3)
 
 
+def test_turning_analyzer_adds_darkness_between_patterns():
+    """The face is dark while the analyzer turns; eyes may count that darkness as a flash."""
+    rig = load_rig("gradient")
+    lit = next(step for step in gradient_plan(rig).steps if step.settings["pattern"] == "full")
+    asked = ("parallel", "crossed", "crossed", "parallel")
+    steps = tuple(
+        dataclasses.replace(lit, id=f"S{k}", settings={**lit.settings, "polarizer": one})
+        for k, one in enumerate(asked)
+    )
+    expected_s = 4 * lit.settings["dwell_s"] + 2 * rig.polarizer_move_s
+    assert flicker_report(Plan("gradient", steps), rig).seconds == pytest.approx(expected_s)
+
+
 def test_mean_light_excludes_rests():
     rows = [LedRow((0,), 1.0, 1.0), LedRow((1,), 1.0, 1.0)]
     assert flicker_of_rows(rows, WEIGHTS).mean_w_m2 == pytest.approx(2.0, rel=1e-6)
@@ -176,6 +191,54 @@ def test_flashes_count_within_one_second():
     assert count_flashes(signal, min_change=0.1) == 1.0
     short = round(0.4 / EYE_SAMPLE_S)
     assert count_flashes(np.tile(np.r_[np.zeros(short), np.ones(short)], 4), min_change=0.1) == 1.5
+
+
+def test_light_that_only_ends_is_half_a_flash():
+    """The first sample belongs to the signal: one turn from light to dark, none before it."""
+    assert count_flashes(np.r_[1.0, np.zeros(50)], min_change=0.1) == 0.5
+    assert count_flashes(np.r_[0.0, np.ones(50)], min_change=0.1) == 0.5
+    assert count_flashes(np.ones(1), min_change=0.1) == 0.0
+
+
+def test_flashes_at_their_limit_are_too_many():
+    limits = dataclasses.replace(DOME.leds, max_flashes_per_s=3.0, max_flicker_rms=0.1)
+    assert FlickerReport(2.5, 0.1, 1.0, 1.0).within(limits)
+    assert not FlickerReport(3.0, 0.1, 1.0, 1.0).within(limits)
+    assert not FlickerReport(2.5, 0.101, 1.0, 1.0).within(limits)
+
+
+def test_average_over_fusion_keeps_steady_light():
+    seen = average_over_flicker_fusion(np.full(200, 3.0))
+    np.testing.assert_allclose(seen[50:150], 3.0)
+
+
+def test_flicker_of_shortest_judged_duration_counts():
+    """Halves of light and dark at 5 Hz, as long as the rms requires, and one sample less."""
+    count = round(MIN_RMS_DURATION_S / 0.1)
+    rows = [LedRow((0,), float(n % 2), 0.1) for n in range(count)]
+    rows[-1] = dataclasses.replace(
+        rows[-1], dwell_s=MIN_RMS_DURATION_S - sum(row.dwell_s for row in rows[:-1])
+    )
+    assert flicker_of_rows(rows, WEIGHTS).rms > 0.3
+    rows[-1] = dataclasses.replace(rows[-1], dwell_s=rows[-1].dwell_s - EYE_SAMPLE_S)
+    assert flicker_of_rows(rows, WEIGHTS).rms == 0.0
+
+
+def test_overlap_of_lights_adds_to_their_exposure():
+    """LEDs that come on before their row: each row but a piece's first is longer by that."""
+    plan = dome_plan(DOME, tracking_interval=0)
+    means = {
+        overlap_s: flicker_report(
+            plan,
+            dataclasses.replace(
+                DOME, leds=dataclasses.replace(DOME.leds, overlap_s=overlap_s, settle_s=0.01)
+            ),
+        ).mean_w_m2
+        for overlap_s in (0.0, 0.004, 0.008)
+    }
+    added = means[0.004] - means[0.0]
+    assert added > 0.0
+    assert means[0.008] - means[0.0] == pytest.approx(2.0 * added, rel=1e-3)
 
 
 def test_steady_light_has_no_flash():

@@ -150,6 +150,20 @@ def test_dead_lights_have_no_strength_and_no_weight(rng):
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
 
 
+def test_weak_lights_are_measured_and_move_no_other(rng):
+    """LEDs that emit 90 to 20 % of the requested light, which no controller measures."""
+    readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.2)
+    whole = fit_polarizers(readings, rates, variance, good, GLASS)
+    share = np.ones(len(PLACE))
+    share[:8] = np.linspace(0.9, 0.2, 8)
+    weak = fit_polarizers(readings, rates * share, variance, good, GLASS)
+    pull = (weak.strength - share * truth["strength"]) / weak.strength_stderr
+    assert np.abs(pull[:8]).max() < 4.0
+    assert ((1.0 - share) * truth["strength"] > 5.0 * weak.strength_stderr)[:8].all()
+    change = np.abs(weak.strength - whole.strength)[8:] / whole.strength_stderr[8:]
+    assert change.max() < 0.5
+
+
 def test_single_reading_or_saturated_spots_are_refused(rng):
     readings, rates, variance, good, _ = spots(rng, zero_deg=0.5, turn_deg=0.2)
     with pytest.raises(PolarizationError, match="two that differ"):

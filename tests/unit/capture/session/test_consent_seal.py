@@ -1,0 +1,199 @@
+"""A key of the lab: who lacks it cannot widen a consent, whatever he recomputes."""
+
+import json
+import shutil
+import stat
+
+import numpy as np
+import pytest
+
+from capture import raw
+from capture.plan import flash_plan
+from capture.rig import load_rig
+from capture.session import Session, SessionDamage, SessionError, SubjectRecord, reopen_copy, verify
+from capture.session.consent_seal import (
+    KEY_VARIABLE,
+    SEAL_FILE,
+    SEALED_STATE,
+    UNCHECKED_STATE,
+    UNSEALED_STATE,
+)
+from capture.session.contents import read_contents
+from capture.session.journal import seal_line
+from capture.session.manifest import seal
+from skinrig.cli import main
+
+RIG = load_rig("flash").resized(16)
+
+
+@pytest.fixture
+def key(tmp_path, monkeypatch):
+    """The file of a lab's key, which is set."""
+    path = tmp_path / "consent.key"
+    path.write_bytes(bytes(range(32)))
+    path.chmod(0o600)
+    monkeypatch.setenv(KEY_VARIABLE, str(path))
+    return path
+
+
+@pytest.fixture
+def make_session(tmp_path):
+    """Make a closed session whose subject agreed to research."""
+
+    def make(name="s"):
+        words = {"devices": {}, "subject": SubjectRecord("P042", ("research",))}
+        path, plan = tmp_path / name, flash_plan(RIG, darks=1)
+        with Session.create(path, plan=plan, rig=RIG, source="measured", **words) as made:
+            for step, camera in made.pending_frames():
+                values = np.full((10, 16), 600, np.uint16)
+                words = {"pattern": "RGGB", "black": 512, "white": 16383}
+                blob = raw.encode_dng(values, **words, step_id=step.id, session_id=made.id)
+                made.commit(step.id, camera, blob, settings={}, actual={}, t_host_s=0.0)
+            made.close()
+        return path
+
+    return make
+
+
+def forge(path):
+    """Widen a consent, and recompute the seal of the manifest and the chain of the journal."""
+    lines = [line for _, line in read_contents(path, sealing=True).walk.lines]
+    document = json.loads((path / "session.json").read_bytes())
+    document["subject"]["consent_scope"] = ["research", "publication"]
+    del document["seal"]
+    data, head = seal(document)
+    (path / "session.json").write_bytes(data)
+    journal = b""
+    for line in lines:
+        text, head = seal_line(head, line)
+        journal += text
+    (path / "journal.jsonl").write_bytes(journal)
+
+
+def export(path, out, form="mhl"):
+    options = ["--to", form, "--use", "publication", "--out", str(out)]
+    return main(["export", str(path), *options])
+
+
+def test_forged_chain_widens_an_unsealed_consent(make_session, tmp_path, capsys):
+    """The gap that the key closes; `verify` states that nothing was sealed."""
+    path = make_session()
+    assert export(path, tmp_path / "before") == 3
+    forge(path)
+    assert export(path, tmp_path / "after") == 0
+    assert verify(path).consent_seal == UNSEALED_STATE
+    capsys.readouterr()
+    assert main(["verify", str(path)]) == 0
+    assert "consent unsealed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("form", ["mhl", "frames", "event-model"])
+def test_forged_chain_of_sealed_consent_is_refused(key, make_session, tmp_path, capsys, form):
+    path = make_session()
+    assert verify(path).consent_seal == SEALED_STATE
+    forge(path)
+    found = verify(path)
+    assert not found.ok
+    assert "another consent than was sealed" in found.problems[0]
+    with pytest.raises(SessionDamage, match="another consent"):
+        Session.open(path)
+    assert main(["verify", str(path)]) == 3
+    assert export(path, tmp_path / "out", form) == 3
+    assert "[SR-SES-017]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_forger_gains_nothing_by_other_seals(key, make_session, tmp_path, capsys):
+    """A removed seal, and that of another session, of another key, a link or a long file."""
+    path, other = make_session(), make_session("other")
+    forge(path)
+    (path / SEAL_FILE).unlink()
+    assert export(path, tmp_path / "out") == 3
+    assert "[SR-SES-016]" in capsys.readouterr().err
+    for content in ((other / SEAL_FILE).read_bytes(), b"", b"0" * 64 + b"\n", bytes(1000)):
+        (path / SEAL_FILE).write_bytes(content)
+        assert not verify(path).ok
+        assert export(path, tmp_path / "out") == 3
+    (path / SEAL_FILE).unlink()
+    (path / SEAL_FILE).symlink_to(other / SEAL_FILE)
+    assert not verify(path).ok
+    assert verify(other).ok
+
+
+def test_sealed_consent_without_key_is_not_checked(key, make_session, monkeypatch, capsys):
+    path = make_session()
+    monkeypatch.delenv(KEY_VARIABLE)
+    assert verify(path).ok
+    assert verify(path).consent_seal == UNCHECKED_STATE
+    assert main(["verify", str(path)]) == 0
+    assert f"not checked without {KEY_VARIABLE}" in capsys.readouterr().out
+    forge(path)
+    assert verify(path).ok  # nobody can find it without the key
+
+
+def test_another_key_does_not_open_a_session(key, make_session):
+    path = make_session()
+    key.write_bytes(bytes(32))
+    assert not verify(path).ok
+
+
+def test_seal_is_its_owners_and_without_key(key, make_session):
+    path = make_session()
+    assert stat.S_IMODE((path / SEAL_FILE).stat().st_mode) == 0o600
+    assert key.read_bytes() not in (path / SEAL_FILE).read_bytes()
+    assert verify(path).warnings == ()
+
+
+def test_copies_of_sealed_session_are_sealed(key, make_session, tmp_path):
+    path = make_session()
+    copy, _ = reopen_copy(path, tmp_path / "copy")
+    copy.release()
+    assert verify(tmp_path / "copy").consent_seal == SEALED_STATE
+    argv = ["export", str(path), "--to", "mhl", "--use", "research"]
+    assert main([*argv, "--out", str(tmp_path / "out")]) == 0
+    assert verify(tmp_path / "out").consent_seal == SEALED_STATE
+    shutil.rmtree(path / "frames")
+    assert not verify(path).ok
+
+
+def test_command_seals_older_session_once(make_session, key, monkeypatch, capsys):
+    monkeypatch.delenv(KEY_VARIABLE)
+    path = make_session()
+    assert main(["session", "seal", str(path)]) == 3
+    assert KEY_VARIABLE in capsys.readouterr().err
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
+    assert "SR-SES-016" in verify(path).problems[0]
+    for _ in range(2):
+        assert main(["session", "seal", str(path)]) == 0
+        assert "P042: research" in capsys.readouterr().out
+    assert verify(path).consent_seal == SEALED_STATE
+    forge(path)
+    assert main(["session", "seal", str(path)]) == 3
+    assert not verify(path).ok
+
+
+def test_command_seals_no_damaged_session(make_session, key, monkeypatch):
+    monkeypatch.delenv(KEY_VARIABLE)
+    path = make_session()
+    journal = path / "journal.jsonl"
+    journal.write_bytes(journal.read_bytes().replace(b"S000", b"S009"))
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
+    assert main(["session", "seal", str(path)]) == 3
+    assert not (path / SEAL_FILE).exists()
+
+
+@pytest.mark.parametrize(
+    ("size", "mode", "fault"),
+    [(31, 0o600, "31 bytes"), (5000, 0o600, "5000 bytes"), (32, 0o640, "mode 640"), (None, 0, "")],
+)
+def test_unfit_key_is_refused_before_a_session(
+    tmp_path, make_session, monkeypatch, size, mode, fault
+):
+    path = tmp_path / "key"
+    if size is not None:
+        path.write_bytes(bytes(size))
+        path.chmod(mode)
+    monkeypatch.setenv(KEY_VARIABLE, str(path))
+    with pytest.raises(SessionError, match=fault or "No such file"):
+        make_session()
+    assert not (tmp_path / "s").exists()
