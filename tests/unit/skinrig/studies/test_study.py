@@ -66,7 +66,7 @@ def test_seeds_go_round_subjects(written):
 def test_every_seed_multiplies_subjects_and_ages():
     made = study_of(group(every_seed=True, calibration_age_days=(0, 30))).list_cases()
     assert len(made) == 2 * 4 * 2
-    assert made[1].variant == "384 px, calibrated 30 days ago"
+    assert made[1].name == "flash I 10, 384 px, calibrated 30 days ago"
 
 
 def test_key_depends_on_everything_that_matters():
