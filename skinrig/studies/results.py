@@ -58,7 +58,7 @@ def write_results(
     errors: Mapping[str, str],
     out: Path,
 ) -> None:
-    """Write ``study.csv``, ``summary.csv``, ``study.json`` and ``report.html``; equal results give equal bytes.
+    """Write the tables, the document and the page; equal results give equal bytes.
 
     Parameters
     ----------
