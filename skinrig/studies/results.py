@@ -28,11 +28,11 @@ TABLE_COLUMNS: Final = (
     *("quantity", "truths"),
     *("median_error", "half_width_68", "unit", "inside_68", "inside_95", "failure"),
 )
-CONDITIONS: Final = ("calibration_age_days", "iso_factor")
+CASE_CONDITIONS: Final = ("calibration_age_days", "iso_factor")
 """Fields of a case by which error and coverage are divided, next to the skin type."""
-ALL: Final = "all"
+ALL_SKIN: Final = "all"
 SUMMARY_COLUMNS: Final = (
-    *("quantity", "skin", *CONDITIONS, "cases", "median_error", "half_width_68", "unit"),
+    *("quantity", "skin", *CASE_CONDITIONS, "cases", "median_error", "half_width_68", "unit"),
     *(f"{name}_{n}" for n in COVERAGE_RANGES for name in ("inside", "low", "high", "verdict")),
 )
 
@@ -45,9 +45,9 @@ class Part:
 
     quantity: str
     skin: str
-    """Skin type, or `ALL`."""
+    """Skin type, or `ALL_SKIN`."""
     conditions: Mapping[str, float]
-    """Values of `CONDITIONS`; a missing one: all values."""
+    """Values of `CASE_CONDITIONS`; a missing one: all values."""
     judged: Sequence[JudgedCase]
 
 
@@ -145,7 +145,9 @@ def format_summary(document: Mapping[str, Any]) -> str:
         for one in row["coverage"].values():
             cells += [format(one[name], ".3f") for name in ("inside", "low", "high")]
             cells.append(one["verdict"])
-        keys = (ALL if row[name] is None else format(row[name], "g") for name in CONDITIONS)
+        keys = (
+            ALL_SKIN if row[name] is None else format(row[name], "g") for name in CASE_CONDITIONS
+        )
         writer.writerow((row["quantity"], row["skin"], *keys, row["cases"], *cells))
     return stream.getvalue()
 
@@ -154,12 +156,12 @@ def _list_parts(judged: Sequence[JudgedCase]) -> Iterator[Part]:
     """Yield all cases of each quantity, and its cases by one property that has several values."""
     for quantity, own in _group(judged, lambda case, row: row.quantity).items():
         types = _group(own, lambda case, row: case.skin)
-        common = ALL if len(types) > 1 else next(iter(types))
+        common = ALL_SKIN if len(types) > 1 else next(iter(types))
         yield Part(quantity, common, {}, own)
         if len(types) > 1:
             ordered = sorted(types, key=SKIN_TYPES.index)
             yield from (Part(quantity, skin, {}, types[skin]) for skin in ordered)
-        for name in CONDITIONS:
+        for name in CASE_CONDITIONS:
             values = _group(own, lambda case, row, name=name: getattr(case, name))
             if len(values) > 1:
                 for value in sorted(values):
@@ -169,13 +171,13 @@ def _list_parts(judged: Sequence[JudgedCase]) -> Iterator[Part]:
 def _list_cells(judged: Sequence[JudgedCase]) -> Iterator[Part]:
     """Yield the cases of each type, age and ISO of the quantities that have several conditions."""
     for quantity, own in _group(judged, lambda case, row: row.quantity).items():
-        conditions = _group(own, lambda case, row: tuple(getattr(case, n) for n in CONDITIONS))
+        conditions = _group(own, lambda case, row: tuple(getattr(case, n) for n in CASE_CONDITIONS))
         if len(conditions) == 1:
             continue
         for values in sorted(conditions):
             types = _group(conditions[values], lambda case, row: case.skin)
             for skin in sorted(types, key=SKIN_TYPES.index):
-                named = dict(zip(CONDITIONS, values, strict=True))
+                named = dict(zip(CASE_CONDITIONS, values, strict=True))
                 yield Part(quantity, skin, named, types[skin])
 
 
@@ -195,7 +197,7 @@ def _pool(part: Part, confidence: float) -> dict[str, Any]:
     return {
         "quantity": part.quantity,
         "skin": part.skin,
-        **{name: part.conditions.get(name) for name in CONDITIONS},
+        **{name: part.conditions.get(name) for name in CASE_CONDITIONS},
         "cases": len(rows),
         "unit": rows[0].unit,
         "median_error": float(np.median([row.error for row in rows])),
