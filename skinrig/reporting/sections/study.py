@@ -46,7 +46,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         f"intervals. {_describe_ranges()} Verdicts: kept, the coverage is in its range; open, only "
         "a part of its interval is, as cases are few; missed, the whole interval is outside. If "
         "all intervals are correct, any verdict is missed with a probability of "
-        f"{100 * FALSE_ALARM_RATE:g} % at most."
+        f"{100 * FALSE_ALARM_RATE:g} % at most. Numbers below the figures count cases."
     )
     by_quantity: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -146,7 +146,7 @@ def _check_coverage(rows: Sequence[Mapping[str, Any]], checks: list[page.Check])
 
 def _draw(quantity: str, rows: list[Mapping[str, Any]]) -> list[str]:
     """Return the drawings of error and coverage over parts of the cases."""
-    labels = ["\n".join([*describe_part(row).split(" ", 1), f"n = {row['cases']}"]) for row in rows]
+    labels = ["\n".join([*describe_part(row).split(" ", 1), str(row["cases"])]) for row in rows]
     error = {"error": [_number(row["median_error"]) for row in rows]}
     error["half width of 68 %"] = [_number(row["half_width"]) for row in rows]
     unit = format_unit(rows[0]["unit"])
