@@ -96,8 +96,10 @@ def format_table(
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(TABLE_COLUMNS)
     for key, case in cases.items():
-        head = (key, case.rig, case.subject, case.skin, case.seed, case.setup)
-        head += (case.calibration_age_days, format(case.iso_factor, "g"))
+        head = (
+            *(key, case.rig, case.subject, case.skin, case.seed, case.setup),
+            *(case.calibration_age_days, format(case.iso_factor, "g")),
+        )
         for row in quantities.get(key, ()):
             figures = (row.error, row.width, row.unit, row.inside_68, row.inside_95)
             cells = (format(one, ".6g") if isinstance(one, float) else one for one in figures)
@@ -162,7 +164,9 @@ def _list_parts(judged: Sequence[JudgedCase]) -> Iterator[Part]:
             ordered = sorted(types, key=SKIN_TYPES.index)
             yield from (Part(quantity, skin, {}, types[skin]) for skin in ordered)
         for name in CASE_CONDITIONS:
-            values = _group(own, lambda case, row, name=name: getattr(case, name))
+            values: dict[Any, list[JudgedCase]] = {}
+            for case, row in own:
+                values.setdefault(getattr(case, name), []).append((case, row))
             if len(values) > 1:
                 for value in sorted(values):
                     yield Part(quantity, common, {name: value}, values[value])
