@@ -175,6 +175,36 @@ class Rig(Document):
         )
         return dataclasses.replace(self, views=views)
 
+    def at_iso(self, factor: float) -> Rig:
+        """Return this rig with cameras of a higher ISO, and exposures that keep the levels.
+
+        Each level then corresponds to fewer electrons, so that shot noise grows by
+        ``sqrt(factor)`` and read noise, relative to the level, by ``factor``.
+
+        Parameters
+        ----------
+        factor
+            ISO over the nominal one, > 0.
+
+        Raises
+        ------
+        RigError
+            For another factor.
+
+        Examples
+        --------
+        >>> cam = load_rig("flash").view("cam")
+        >>> cam.full_well_e / load_rig("flash").at_iso(4.0).view("cam").full_well_e
+        4.0
+        """
+        if not 0.0 < factor < math.inf:
+            fault = Fault("factor", str(factor), "a number above 0")
+            raise RigError("ISO cannot be changed", faults=[fault])
+        views = tuple(
+            dataclasses.replace(v, full_well_e=v.full_well_e / factor) for v in self.views
+        )
+        return dataclasses.replace(self, views=views)
+
     def subset(
         self, *, lights: Sequence[str] | None = None, views: Sequence[str] | None = None
     ) -> Rig:

@@ -286,7 +286,7 @@ def farthest_point_sample(directions: np.ndarray[Any, Any], count: int) -> list[
 def _rig(order: DomeOrder) -> Rig:
     """Return the dome with the lights, cameras and image size of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
-    dome = load_rig("dome")
+    dome = load_rig("dome").at_iso(order.iso_factor)
     dome = dome.with_scanner() if order.scanner else dataclasses.replace(dome, scanner=None)
     if order.plan is None:
         lights, views = LIGHT_COUNTS[order.size], VIEW_COUNTS[order.size]

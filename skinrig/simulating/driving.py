@@ -75,6 +75,8 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         asked["plan"] = order.plan.to_json()
     if order.renderer != "mitsuba":
         asked["renderer"] = order.renderer
+    if order.iso_factor != 1.0:
+        asked["iso_factor"] = order.iso_factor
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
     return asked | rig_settings | session_settings(order)

@@ -143,7 +143,7 @@ class _StateScenes:
 
 def plan_capture(order: FlashOrder) -> tuple[Rig, Plan]:
     """Return the rig at the image size of an order, and the plan; that of a sequence differs."""
-    rig = load_rig("flash")
+    rig = load_rig("flash").at_iso(order.iso_factor)
     is_patch = order.renderer == "reference"
     width = order.width_px or (MIN_WIDTH_PX if is_patch else WIDTHS_PX[order.size])
     if is_patch:

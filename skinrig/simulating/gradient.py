@@ -81,7 +81,7 @@ def plan_capture(order: GradientOrder) -> tuple[Rig, Plan]:
     """Return the rig at the image size of an order, and the plan."""
     # the 12 mm ball needs the whole sensor at every size
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
-    rig = load_rig("gradient").cropped(order.width_px or width_px)
+    rig = load_rig("gradient").at_iso(order.iso_factor).cropped(order.width_px or width_px)
     angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
     details = select_attributes(order, "target", "steps")
     return rig, order.plan or DefaultPlan(angles=angles, **details).of(rig)

@@ -105,10 +105,12 @@ class SimulationOrder:
     seed: int = 0
     """Seed of the subject and of the rig as built; without `session_seed` also of the capture."""
     session_seed: int | None = None
-    """Seed of one capture of the same subject with the same rig: noise, position, motion, scan and
-    controllers. None: `seed`, and the face at the center of the rig."""
+    """Seed of one capture of a subject and rig: noise, position, motion, scan, controllers. None:
+    `seed`, and the face at the center of the rig."""
     days_ago: int = 0
     """Days before today of the session; LEDs and frames age, see `rigsim.as_built.aging`."""
+    iso_factor: float = 1.0
+    """ISO of all cameras over the nominal one, see `capture.rig.Rig.at_iso`."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
@@ -139,8 +141,7 @@ class SimulationOrder:
         require_size(self.size)
         require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
         for name in ("seed", "session_seed", "days_ago"):
-            number = getattr(self, name)
-            if number is not None and number < 0:
+            if (number := getattr(self, name)) is not None and number < 0:
                 raise SimulationError(f"{name}: got {number}, expected 0 or more")
         width_px = getattr(self, "width_px", None)
         if width_px is not None and width_px < MIN_WIDTH_PX:

@@ -58,7 +58,7 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
 
 def plan_capture(order: ProbeOrder) -> tuple[Rig, Plan]:
     """Return the rig and the plan of an order."""
-    rig = load_rig("probe")
+    rig = load_rig("probe").at_iso(order.iso_factor)
     details = select_attributes(order, "target", "sites", "repeats", "angles")
     return rig, order.plan or DefaultPlan(**details).of(rig)
 

@@ -63,7 +63,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     prompted = [state for state in STATE_NAMES if state != "neutral"]
     require_choice("sequence", sequence.state, prompted, SimulationError)
     width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
-    rig = load_rig("flash").resized(width)
+    rig = load_rig("flash").at_iso(order.iso_factor).resized(width)
     constant_s = order.relaxation_s
     if constant_s is not None and not 0 < constant_s < np.inf:
         raise SimulationError(f"relaxation: got {constant_s}, expected seconds > 0")

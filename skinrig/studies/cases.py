@@ -35,7 +35,7 @@ class JudgedQuantity:
     """Errors and coverage of one quantity of one case: the record of an `IntervalTrial`."""
 
     quantity: str
-    """With the variant of its case, where it has one."""
+    """With the setup of its case, where it has one."""
     band: str
     """Skin type of the case."""
     truths: int
@@ -57,7 +57,7 @@ class JudgedQuantity:
     @classmethod
     def of(cls, trial: IntervalTrial, case: Case) -> "JudgedQuantity":
         """Return the record of a trial."""
-        name = ", ".join(filter(None, (trial.quantity, case.variant)))
+        name = ", ".join(filter(None, (trial.quantity, case.setup)))
         inside = [
             trial.inside_fraction(level) if trial.truths else float("nan")
             for level in COVERAGE_RANGES
@@ -116,9 +116,8 @@ def judge_case(case: Case, folder: Path) -> Iterator[IntervalTrial]:
     subject: dict[str, Any] = {"leave_out": case.leave_out} if case.leave_out else {}
     if case.rig == "gradient":
         subject["subject"] = case.subject
-    variant = CaptureVariant(
-        case.calibration_age_days, {k: n for k, n in numbers.items() if n is not None}, subject
-    )
+    given = {k: n for k, n in numbers.items() if n is not None} | {"iso_factor": case.iso_factor}
+    variant = CaptureVariant(case.calibration_age_days, given, subject)
     people = {case.seed: case.site or case.subject}
     options: dict[str, Any] = {"variant": variant}
     if case.rig == "probe":

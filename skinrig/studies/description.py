@@ -1,4 +1,4 @@
-"""Describe a study in a TOML file: groups of cases over subjects, seeds, sizes and ages.
+"""Describe a study in a TOML file: groups of cases over subjects, seeds, sizes, ages and ISO.
 
 ::
 
@@ -54,6 +54,8 @@ MEDIUM_TYPE: Final = "medium"
 MAX_CASES: Final = 100_000
 MAX_AGE_DAYS: Final = DEFAULT_VALIDITY_DAYS - 1
 """Oldest calibration: it is valid until the end of a simulation that passes midnight."""
+ISO_RANGE: Final = (0.25, 64.0)
+"""Range of ISO over the nominal one."""
 DEFAULT_WIDTHS_PX: Final = {"flash": 384, "dome": 320, "gradient": 128}
 _SEEDS = re.compile(r"(\d{1,9})(?:\.\.(\d{1,9}))?")
 _MEMBERS = re.compile(r"P(\d{2})\.\.P(\d{2})")
@@ -90,20 +92,21 @@ class Case:
     size: CaseSize
     calibration_age_days: int
     """Days between calibration and capture."""
+    iso_factor: float
+    """ISO of the cameras over the nominal one, of calibration and capture."""
     site: str
     """Site of the skin before the gradient sphere; empty for other rigs."""
     leave_out: tuple[str, ...]
     """Effects that the simulation omits."""
 
     @property
-    def variant(self) -> str:
-        """Text of size, age, site and omitted effects, by which a study's table is grouped."""
+    def setup(self) -> str:
+        """Text of size, site and omitted effects, which are part of a quantity's name."""
         size = self.size
         parts = [
             f"{size.width_px} px" if size.width_px else "",
             f"{size.lights} lights" if size.lights else "",
             f"{size.views} cameras" if size.views else "",
-            f"calibrated {self.calibration_age_days} days ago" if self.calibration_age_days else "",
             self.site,
             *(f"without {name}" for name in self.leave_out),
         ]
@@ -111,8 +114,14 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Text of rig, subject, seed and variant, for progress and messages."""
-        return ", ".join(filter(None, (f"{self.rig} {self.subject} {self.seed}", self.variant)))
+        """Text of all that distinguishes the case from others, for progress and messages."""
+        parts = [
+            f"{self.rig} {self.subject} {self.seed}",
+            self.setup,
+            f"calibrated {self.calibration_age_days} days ago" if self.calibration_age_days else "",
+            f"ISO x {self.iso_factor:g}" if self.iso_factor != 1.0 else "",
+        ]
+        return ", ".join(filter(None, parts))
 
     def key(self, software: str) -> str:
         """Return the hash of all that the case's result depends on.
@@ -131,7 +140,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseGroup(Document):
-    """Cases of one rig: subjects, seeds, sizes and ages of the calibration."""
+    """Cases of one rig: subjects, seeds, sizes, ages of the calibration and ISO."""
 
     rig: str
     subjects: tuple[str, ...]
@@ -142,6 +151,8 @@ class CaseGroup(Document):
     """True: each subject with each seed; False: seeds go round the subjects."""
     sizes: tuple[CaseSize, ...] = (CaseSize(),)
     calibration_age_days: tuple[int, ...] = (0,)
+    iso_factors: tuple[float, ...] = (1.0,)
+    """ISO of the cameras over the nominal one; levels of images stay, noise grows."""
     site: str = ""
     """Site of the skin (gradient); empty: forehead."""
     leave_out: tuple[str, ...] = ()
@@ -151,12 +162,15 @@ class CaseGroup(Document):
         checks = FaultCollector("the group of cases", StudyError)
         rigs = ", ".join(RIG_KINDS)
         checks.check("rig", self.rig, self.rig in RIG_KINDS, f"one of {rigs}")
-        for name in ("subjects", "sizes", "calibration_age_days"):
+        for name in ("subjects", "sizes", "calibration_age_days", "iso_factors"):
             checks.check(name, "none", bool(getattr(self, name)), "at least one")
         ages = self.calibration_age_days
         young = all(0 <= age <= MAX_AGE_DAYS for age in ages)
         wanted = f"0 to {MAX_AGE_DAYS} days: calibrations expire"
         checks.check("calibration_age_days", ages, young, wanted)
+        low, high = ISO_RANGE
+        usual = all(low <= factor <= high for factor in self.iso_factors)
+        checks.check("iso_factors", self.iso_factors, usual, f"{low:g} to {high:g}")
         for text in self.subjects:
             some = next(expand_subjects(text), None) is not None
             checks.check("subjects", text, some, 'range "FIRST..LAST" with FIRST <= LAST')
@@ -191,8 +205,8 @@ class CaseGroup(Document):
             else ((subjects[k % len(subjects)], seed) for k, seed in enumerate(seeds))
         )
         width_px = DEFAULT_WIDTHS_PX.get(self.rig)
-        for (subject, seed), size, age in itertools.product(
-            pairs, self.sizes, self.calibration_age_days
+        for (subject, seed), size, age, factor in itertools.product(
+            pairs, self.sizes, self.calibration_age_days, self.iso_factors
         ):
             given = size if size.width_px else dataclasses.replace(size, width_px=width_px)
             yield Case(
@@ -202,6 +216,7 @@ class CaseGroup(Document):
                 seed=seed,
                 size=given,
                 calibration_age_days=age,
+                iso_factor=factor,
                 site=self.site or ("forehead" if self.rig == "gradient" else ""),
                 leave_out=self.leave_out,
             )
@@ -238,6 +253,7 @@ class StudyFile(Document):
         count = sum(
             len(g.sizes)
             * len(g.calibration_age_days)
+            * len(g.iso_factors)
             * len(g.list_seeds())
             * (sum(sum(1 for _ in expand_subjects(s)) for s in g.subjects) if g.every_seed else 1)
             for g in self.groups

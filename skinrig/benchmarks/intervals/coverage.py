@@ -207,7 +207,21 @@ def corrected_confidence(trials: Sequence[JudgedSubject]) -> float:
 
     Notes
     -----
-    Bonferroni: each coverage is judged at two levels, each with two one-sided limits.
+    See `share_confidence`.
     """
-    counted = len(group_by_band(trials, level=68, confidence=0.95))
-    return 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * max(counted, 1))
+    return share_confidence(len(group_by_band(trials, level=68, confidence=0.95)))
+
+
+def share_confidence(count: int) -> float:
+    """Return the confidence of each of `count` coverages that share one `FALSE_ALARM_RATE`.
+
+    Notes
+    -----
+    Bonferroni: each coverage is judged at two levels, each with two one-sided limits.
+
+    Examples
+    --------
+    >>> round(share_confidence(1), 6), round(share_confidence(10), 6)
+    (0.975, 0.9975)
+    """
+    return 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * max(count, 1))

@@ -51,8 +51,8 @@ class CaptureVariant:
 
     calibration_age_days: int = 0
     """Days between the calibration and the subject's session."""
-    size: Mapping[str, int] = field(default_factory=dict)
-    """Further fields of the orders of targets and subjects, such as lights and views."""
+    size: Mapping[str, float] = field(default_factory=dict)
+    """Further fields of the orders of targets and subjects, such as lights, views and ISO."""
     subject: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of the orders of subjects alone."""
 

@@ -52,6 +52,13 @@ def test_a_resized_rig_keeps_its_field_of_view(flash, width_px):
     assert small.height_px % 2 == 0
 
 
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
+def test_iso_that_is_not_positive_is_refused(flash, factor):
+    assert flash.at_iso(1.0) == flash
+    with pytest.raises(RigError, match="a number above 0"):
+        flash.at_iso(factor)
+
+
 def test_a_rig_survives_its_json(flash, flash_json):
     assert rig_from_json(flash_json) == flash
 

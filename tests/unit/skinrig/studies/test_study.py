@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
+from rigsim.sensor import make_sensor
 from skinrig.console import Console
 from skinrig.errors import MissingExtra, UnusableError
+from skinrig.simulating.orders import order_for
 from skinrig.studies import description, executors
 from skinrig.studies.cases import CaseOrder, run_case
 from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
@@ -66,7 +68,7 @@ def test_seeds_go_round_subjects(written):
 def test_every_seed_multiplies_subjects_and_ages():
     made = study_of(group(every_seed=True, calibration_age_days=(0, 30))).list_cases()
     assert len(made) == 2 * 4 * 2
-    assert made[1].variant == "384 px, calibrated 30 days ago"
+    assert made[1].name == "flash I 10, 384 px, calibrated 30 days ago"
 
 
 def test_key_depends_on_everything_that_matters():
@@ -77,11 +79,12 @@ def test_key_depends_on_everything_that_matters():
             {"subjects": ("II",)},
             {"seeds": "11"},
             {"calibration_age_days": (3,)},
+            {"iso_factors": (4.0,)},
             {"leave_out": ("lateral",)},
         )
     )
     keys = {case.key("a") for case in (usual, *others)} | {usual.key("b")}
-    assert len(keys) == 6
+    assert len(keys) == 7
     assert usual.key("a") == study_of(group()).list_cases()[0].key("a")
 
 
@@ -145,6 +148,8 @@ def test_changed_subject_file_refuses_case(tmp_path, monkeypatch, change, word):
         ({"calibration_age_days": (0, -1)}, "0 to 89 days"),
         ({"calibration_age_days": (90,)}, "0 to 89 days"),
         ({"calibration_age_days": (10**10,)}, "0 to 89 days"),
+        ({"iso_factors": (1.0, 0.0)}, "0.25 to 64"),
+        ({"iso_factors": (float("nan"),)}, "0.25 to 64"),
         ({"seeds": "0..999999999"}, "at most"),
         ({"site": "nose"}, "site"),
         ({"leave_out": ("gold",)}, "gold"),
@@ -226,6 +231,60 @@ def test_coverage_verdict_follows_true_spread(tmp_path):
     assert right["68"]["inside"] == pytest.approx(0.683, abs=0.02)
     assert {one["verdict"] for one in wrong.values()} == {"missed"}
     assert wrong["68"]["inside"] == pytest.approx(0.383, abs=0.02)
+
+
+def test_coverage_is_divided_by_type_age_and_iso(tmp_path):
+    """Every part pools its own cases; only cells have a type, an age and an ISO at once."""
+    groups = [
+        group(seeds="0..7"),
+        group(seeds="8..13", calibration_age_days=(30,)),
+        group(seeds="14..17", iso_factors=(4.0,)),
+    ]
+    run_study(study_of(*groups), tmp_path, judge=judge_by_drawing)
+    document = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
+    counts = {
+        (row["skin"], row["calibration_age_days"], row["iso_factor"]): row["cases"]
+        for row in document["quantities"]
+    }
+    assert counts == {
+        ("all", None, None): 18,
+        ("I", None, None): 9,
+        ("VI", None, None): 9,
+        ("all", 0, None): 12,
+        ("all", 30, None): 6,
+        ("all", None, 1): 14,
+        ("all", None, 4): 4,
+    }
+    cells = {
+        (row["skin"], row["calibration_age_days"], row["iso_factor"]): row["cases"]
+        for row in document["cells"]
+    }
+    assert sum(cells.values()) == 18
+    assert cells["VI", 30, 1] == 3
+    inside = {row["seed"]: float(row["inside_68"]) for row in table(tmp_path)}
+    old = [inside[str(seed)] for seed in range(8, 14)]
+    row = next(one for one in document["quantities"] if one["calibration_age_days"] == 30)
+    assert row["coverage"]["68"]["inside"] == pytest.approx(sum(old) / 6, abs=1e-5)
+    with (tmp_path / "summary.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(counts) + len(cells)
+    assert float(rows[4]["inside_68"]) == pytest.approx(sum(old) / 6, abs=1e-3)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "30 days" in page
+    assert "ISO x 4" in page
+
+
+@pytest.mark.parametrize("rig", ["flash", "dome", "gradient", "probe"])
+def test_iso_of_case_reaches_its_sensor(rig):
+    planner = __import__(f"skinrig.simulating.{rig}", fromlist=["plan_capture"])
+    usual, noisy = (
+        make_sensor(planner.plan_capture(order_for(rig, out="session", iso_factor=k))[0].views[0])
+        for k in (1.0, 4.0)
+    )
+    (shot, floor), (more, higher) = usual.noise_profile(), noisy.noise_profile()
+    assert more == pytest.approx(4.0 * shot)
+    rounding = 1.0 / (12.0 * (usual.white - usual.black) ** 2)
+    assert higher - rounding == pytest.approx(16.0 * (floor - rounding))
 
 
 def test_second_writer_is_refused(written, tmp_path):
