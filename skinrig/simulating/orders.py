@@ -1,6 +1,7 @@
 """Orders and results of simulated captures, with one class of order per rig."""
 
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from datetime import UTC, datetime, timedelta
@@ -22,6 +23,8 @@ PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
+MAX_EPOCH_S = 253_402_300_799
+"""Last second of the year 9999, since 1970."""
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
@@ -65,6 +68,31 @@ class SimulationResult:
 def require_size(size: str) -> None:
     """Raise unless a size is "small" or "full"."""
     require_choice("size", size, PICTURE_SIZES, SimulationError)
+
+
+def read_clock() -> datetime:
+    """Return the present time, or that of the environment variable SOURCE_DATE_EPOCH.
+
+    With it, equal commands write equal bytes.
+
+    Raises
+    ------
+    SimulationError
+        When the variable is not a number of seconds since 1970.
+
+    References
+    ----------
+    Reproducible Builds, "SOURCE_DATE_EPOCH specification", version 1.1, 2017.
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if not given:
+        return datetime.now(UTC)
+    if not (given.isascii() and given.isdigit() and int(given) <= MAX_EPOCH_S):
+        raise SimulationError(
+            f"SOURCE_DATE_EPOCH: got {given!r}, expected whole seconds since 1970, at most "
+            f"{MAX_EPOCH_S}; correct the environment variable [SR-SIM-009]"
+        )
+    return datetime.fromtimestamp(int(given), UTC)
 
 
 def truth_folder(session: Path) -> Path:
@@ -121,7 +149,7 @@ class SimulationOrder:
     resume: bool = False
     """Resume an interrupted session; its frames are kept."""
     created: datetime | None = None
-    """Date of the session; None: now, less `days_ago`."""
+    """Date of the session; None: now, less `days_ago`; see `read_clock`."""
     person: SubjectRecord | None = None
     """Pseudonym and consent to record; None: consent to :data:`SIMULATED_USES`, or that of the
     resumed session. A record that differs from the resumed session's is refused."""
@@ -167,11 +195,9 @@ class SimulationOrder:
         return self.seed if self.session_seed is None else self.session_seed
 
     @property
-    def captured_at(self) -> datetime | None:
-        """Date of the session; None: now."""
-        if self.created is not None or not self.days_ago:
-            return self.created
-        return datetime.now(UTC) - timedelta(days=self.days_ago)
+    def captured_at(self) -> datetime:
+        """Date of the session: `created`, or now less `days_ago`."""
+        return self.created or read_clock() - timedelta(days=self.days_ago)
 
     @property
     def rig_age(self) -> RigAge:
