@@ -69,7 +69,6 @@ SIMULATIONS: Mapping[str, Sequence[str]] = {
     ),
     "simulate sequence": (
         *("flash", "--width", "48", "--sequence", "exercise", "--duration", "120"),
-        *("--omit", "lateral,interreflections,relief_shadows"),
     ),
     "simulate dome": (
         *("dome", "--width", "64", "--lights", "12", "--views", "2"),
@@ -121,16 +120,23 @@ def hash_folder(folder: Path) -> dict[str, str]:
     }
 
 
+def list_outputs(out: Path) -> list[Path]:
+    """Return an output folder and, of a session, its ground truth's folders."""
+    return [out, *sorted(out.parent.glob(f"truth-{out.name}*"))]
+
+
 def hash_outputs(out: Path) -> dict[str, str]:
     """Hash the files of an output folder, and those of a session's ground truth."""
-    truth = out.with_name(f"truth-{out.name}")
-    found = hash_folder(out)
-    return found | {f"truth {name}": digest for name, digest in hash_folder(truth).items()}
+    return {
+        f"{folder.name}/{name}": digest
+        for folder in list_outputs(out)
+        for name, digest in hash_folder(folder).items()
+    }
 
 
 def remove_outputs(out: Path) -> None:
     """Remove an output folder, and the ground truth of a session."""
-    for folder in (out, out.with_name(f"truth-{out.name}")):
+    for folder in list_outputs(out):
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -155,7 +161,7 @@ def run_command(arguments: Sequence[str], log: Path) -> None:
             stream.write(f"{view} {seed}\n")
         return expose(self, view, *given, seed=seed, **light)
 
-    World.expose = count  # type: ignore[method-assign]
+    setattr(World, "expose", count)  # noqa: B010
     os._exit(main_command([*arguments, "--json"]))
 
 
@@ -239,9 +245,8 @@ def kill_until_done(
     found = hash_outputs(out)
     same = code == 0 and found == expected and not list(out.parent.glob(f".{out.name}.*"))
     if not same:
-        differing = sorted(
-            file for file in found | expected if found.get(file) != expected.get(file)
-        )
+        names = found.keys() | expected.keys()
+        differing = sorted(file for file in names if found.get(file) != expected.get(file))
         print(f"{name}: exit code {code}, differing {differing[:5]}", file=sys.stderr)
     computed = read_computed(log)
     log.with_suffix(".computed").unlink(missing_ok=True)
