@@ -41,6 +41,8 @@ from rigsim.world import World
 from skinrig.cli import main as main_command
 
 FORK = multiprocessing.get_context("fork")
+MAX_KILLS_PER_CHAIN = 8
+"""Kills until a command may end: on a machine that became busier it might never."""
 DATE_EPOCH_S = 1_795_000_000
 
 RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
@@ -301,7 +303,14 @@ def judge(
             remove_outputs(out)
         given_out = [*run, "--out", str(out)]
         chain = kill_until_done(
-            name, given_out, out, whole=undisturbed[name], rng=rng, again=again, span=span
+            name,
+            given_out,
+            out,
+            whole=undisturbed[name],
+            rng=rng,
+            again=again,
+            span=span,
+            most=MAX_KILLS_PER_CHAIN,
         )
         found += chain
         for kill in chain:

@@ -28,6 +28,7 @@ class ExposureLog:
         self._path = path
         if not resume:
             path.unlink(missing_ok=True)
+        path.touch()  # a missing log is a lost one
 
     def add(self, entry: Mapping[str, Any]) -> None:
         """Append an entry."""
