@@ -1,6 +1,5 @@
 """SESSION/ format: atomically written frames, a hash-chained journal, resume and verify."""
 
-from capture.session.copying import CopyReport, copy_session
 from capture.session.disk import Disk
 from capture.session.errors import (
     ConsentError,
@@ -22,7 +21,6 @@ __all__ = [
     "AttachmentLine",
     "CalibrationRef",
     "ConsentError",
-    "CopyReport",
     "Disk",
     "FrameLine",
     "FrameRecord",
@@ -35,7 +33,6 @@ __all__ = [
     "SessionLocked",
     "SubjectRecord",
     "VerifyReport",
-    "copy_session",
     "reopen_copy",
     "resume_unless_complete",
     "verify",

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from capture.session import CopyReport, Session, copy_session
-from capture.session.copying import part_folder
+from capture.session import Session
+from capture.session.copying import CopyReport, copy_session, part_folder
 from skinrig.errors import UsageError
 from skinrig.resources.forecast import (
     ResourceForecast,
@@ -22,7 +22,7 @@ def copy_with_consent(
     read_back: bool,
     progress: Callable[[str], None] | None = None,
 ) -> CopyReport:
-    """Copy a session for a use that its subject agreed to; see `capture.session.copy_session`.
+    """Copy a session for a use that its subject agreed to; see `copy_session`.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def copy_with_consent(
     skinrig.errors.UnusableError
         If the disk has less space than the files need.
     capture.session.SessionError
-        See `capture.session.copy_session`.
+        See `capture.session.copying.copy_session`.
     """
     if use is None:
         raise UsageError("--use: got none; name the purpose of the copy [SR-EXP-001]")

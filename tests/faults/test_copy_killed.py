@@ -11,7 +11,8 @@ import pytest
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, SubjectRecord, copy_session
+from capture.session import Session, SubjectRecord
+from capture.session.copying import copy_session
 
 FORK = multiprocessing.get_context("fork")
 RIG = load_rig("flash").resized(16)

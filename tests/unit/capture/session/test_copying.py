@@ -17,10 +17,9 @@ from capture.session import (
     SessionError,
     SessionLocked,
     SubjectRecord,
-    copy_session,
     verify,
 )
-from capture.session.copying import part_folder
+from capture.session.copying import copy_session, part_folder
 
 RIG = load_rig("flash").resized(16)
 FRAMES = 6
