@@ -1,10 +1,9 @@
 """Orders and results of simulated captures, with one class of order per rig."""
 
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
@@ -18,13 +17,12 @@ from rigsim.mitsuba.variant import Renderer
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, require_choice
 from skinrig.simulating.effect_omission import omission_arguments
+from skinrig.source_date import read_clock
 
 PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
-MAX_EPOCH_S = 253_402_300_799
-"""Last second of the year 9999, since 1970."""
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
@@ -68,31 +66,6 @@ class SimulationResult:
 def require_size(size: str) -> None:
     """Raise unless a size is "small" or "full"."""
     require_choice("size", size, PICTURE_SIZES, SimulationError)
-
-
-def read_clock() -> datetime:
-    """Return the present time, or that of the environment variable SOURCE_DATE_EPOCH.
-
-    With it, equal commands write equal bytes.
-
-    Raises
-    ------
-    SimulationError
-        When the variable is not a number of seconds since 1970.
-
-    References
-    ----------
-    Reproducible Builds, "SOURCE_DATE_EPOCH specification", version 1.1, 2017.
-    """
-    given = os.environ.get("SOURCE_DATE_EPOCH", "")
-    if not given:
-        return datetime.now(UTC)
-    if not (given.isascii() and given.isdigit() and int(given) <= MAX_EPOCH_S):
-        raise SimulationError(
-            f"SOURCE_DATE_EPOCH: got {given!r}, expected whole seconds since 1970, at most "
-            f"{MAX_EPOCH_S}; correct the environment variable [SR-SIM-009]"
-        )
-    return datetime.fromtimestamp(int(given), UTC)
 
 
 def truth_folder(session: Path) -> Path:

@@ -12,6 +12,7 @@ from capture.rig import load_rig
 from capture.session import Session
 from rigsim.world import World
 from rigsim.world.serve import serve_world
+from skinrig.errors import UnusableError
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.resumption import count_shots
 from skinrig.simulating.simulation import simulate_session
@@ -98,7 +99,7 @@ def test_session_of_another_journal_is_not_resumed(tmp_path, monkeypatch):
 @pytest.mark.parametrize("given", ["now", "-3", "1e9", "99999999999999", "١"])
 def test_invalid_source_date_is_refused(tmp_path, monkeypatch, given):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", given)
-    with pytest.raises(SimulationError, match="SOURCE_DATE_EPOCH"):
+    with pytest.raises(UnusableError, match="SOURCE_DATE_EPOCH"):
         simulate_session("flash", tmp_path / "s", **ASKED["flash"])
     assert not (tmp_path / "s").exists()
 
