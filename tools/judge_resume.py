@@ -3,29 +3,47 @@
 Each command runs twice undisturbed; the first run fills the cache of compiled kernels. Then it is
 killed, repeated (`reconstruct`: the same command, `simulate`: with --resume) and killed until it
 ends. The seconds from its first step to the kill are drawn uniformly up to --span of the
-undisturbed run's. Its output is compared with the undisturbed one. Stages and tiles that begin
-again although they began before the kill are counted by the events of --json.
+undisturbed run's. All files of its output are compared with the undisturbed ones; the date of
+simulated sessions is fixed by SOURCE_DATE_EPOCH. Stages and tiles that begin again although they
+began before the kill are counted by the events of --json. A simulation replays its run: the images
+that it computes again are counted, by a log of this tool.
 
     skinrig demo --out DEMO
     python tools/judge_resume.py DEMO --kills 50 --work WORK
+    python tools/judge_resume.py DEMO --kills 50 --work WORK --commands "simulate flash"
 """
 
 import argparse
 import hashlib
 import itertools
 import json
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from multiprocessing.context import ForkProcess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+# imported before processes are forked, which spares each the seconds of the imports
+import skinrig.simulating.dome
+import skinrig.simulating.flash
+import skinrig.simulating.gradient
+import skinrig.simulating.probe  # noqa: F401
+from rigsim.world import World
+from skinrig.cli import main as main_command
+
+FORK = multiprocessing.get_context("fork")
+MAX_KILLS_PER_CHAIN = 8
+"""Kills until a command may end: on a machine that became busier it might never."""
+DATE_EPOCH_S = 1_795_000_000
 
 RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
     "flash": (
@@ -48,10 +66,18 @@ RECONSTRUCTIONS: dict[str, tuple[str, str, str]] = {
 """Session, calibration (empty: none) and maps of each rig in the folder of a demo."""
 SIMULATIONS: Mapping[str, Sequence[str]] = {
     "simulate flash": (
-        *("flash", "--subject", "IV", "--width", "64"),
+        *("flash", "--subject", "IV", "--width", "64", "--state", "neutral", "--state", "smile"),
         *("--omit", "lateral,interreflections,relief_shadows"),
     ),
-    "simulate probe": ("probe", "--subject", "homogeneous:0.08,1.2"),
+    "simulate sequence": (
+        *("flash", "--width", "48", "--sequence", "exercise", "--duration", "120"),
+    ),
+    "simulate dome": (
+        *("dome", "--width", "64", "--lights", "12", "--views", "2"),
+        *("--omit", "lateral,interreflections"),
+    ),
+    "simulate gradient": ("gradient", "--width", "64", "--angles", "0", "--steps", "-1..1"),
+    "simulate probe": ("probe", "--subject", "homogeneous:0.08,1.2", "--sites", "cheek,chin"),
 }
 """Arguments of `skinrig simulate`."""
 
@@ -69,7 +95,8 @@ class Kill:
     same
         Whether the final output equals the undisturbed one.
     interrupted
-        Stages and tiles at work when the process was killed that began again.
+        Stages and tiles at work when the process was killed that began again; of a simulation:
+        images that were computed twice in a chain of kills, at its first.
     left_out
         Stages and tiles that were complete before the kill and began again, as storing them would
         have cost too much.
@@ -95,40 +122,61 @@ def hash_folder(folder: Path) -> dict[str, str]:
     }
 
 
-def hash_outputs(out: Path) -> dict[str, str]:
-    """Hash an output folder, or the plan and frames of a session and its ground truth's images.
+def list_outputs(out: Path) -> list[Path]:
+    """Return an output folder and, of a session, its ground truth's folders."""
+    return [out, *sorted(out.parent.glob(f"truth-{out.name}*"))]
 
-    Documents of a session and its truth contain the time of the capture.
-    """
-    truth = out.with_name(f"truth-{out.name}")
-    if not truth.is_dir():
-        return hash_folder(out)
-    found = hash_folder(out / "frames")
-    images = {name: digest for name, digest in hash_folder(truth).items() if ".exr" in name}
-    return found | {f"truth {name}": digest for name, digest in images.items()}
+
+def hash_outputs(out: Path) -> dict[str, str]:
+    """Hash the files of an output folder, and those of a session's ground truth."""
+    return {
+        f"{folder.name}/{name}": digest
+        for folder in list_outputs(out)
+        for name, digest in hash_folder(folder).items()
+    }
 
 
 def remove_outputs(out: Path) -> None:
     """Remove an output folder, and the ground truth of a session."""
-    for folder in (out, out.with_name(f"truth-{out.name}")):
+    for folder in list_outputs(out):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def start(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
-    """Start skinrig with --json; its events go to a file."""
-    with open(log, "wb") as stream:
-        return subprocess.Popen(
-            [sys.executable, "-m", "skinrig", *arguments, "--json"],
-            stdout=subprocess.DEVNULL,
-            stderr=stream,
-            start_new_session=True,
-        )
+def start(arguments: Sequence[str], log: Path) -> ForkProcess:
+    """Start skinrig with --json in a child of this process; its events go to a file."""
+    process = FORK.Process(target=run_command, args=(arguments, log))
+    process.start()
+    return process
+
+
+def run_command(arguments: Sequence[str], log: Path) -> None:
+    """Run skinrig with its streams in a file, and log each computed exposure."""
+    os.setsid()
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 2)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    sys.stderr = os.fdopen(2, "w", buffering=1)
+    computed, expose = log.with_suffix(".computed"), World.expose
+
+    def count(self: World, view: str, *given: Any, seed: int, **light: Any) -> Any:
+        with computed.open("a") as stream:
+            stream.write(f"{view} {seed}\n")
+        return expose(self, view, *given, seed=seed, **light)
+
+    setattr(World, "expose", count)  # noqa: B010
+    os._exit(main_command([*arguments, "--json"]))
+
+
+def read_computed(log: Path) -> list[str]:
+    """Return the exposures that were computed since the file was removed."""
+    path = log.with_suffix(".computed")
+    return path.read_text().splitlines() if path.exists() else []
 
 
 def read_events(log: Path) -> list[tuple[str, float]]:
     """Return text and seconds of the beginnings of steps in a file."""
     events = []
-    for line in log.read_text().splitlines():
+    for line in (log.read_text() if log.exists() else "").splitlines():
         if line.startswith('{"event"') and line.endswith("}"):
             event = json.loads(line)
             if event["event"] == "progress":
@@ -184,26 +232,45 @@ def kill_until_done(
     code = None
     while code is None:
         after_s = float(rng.uniform(0.0, span * seconds))
-        process = start([*run, *(again if out.exists() else ())], log)
-        while process.poll() is None and not read_events(log):
+        log.unlink(missing_ok=True)
+        begun = (out / "session.json").exists() or not again
+        process = start([*run, *(again if begun else ())], log)
+        while process.is_alive() and not read_events(log):
             time.sleep(0.02)
-        try:
-            code = process.wait(timeout=after_s if len(kills) < most else None)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        process.join(after_s if len(kills) < most else None)
+        if process.is_alive():
+            os.killpg(process.pid or 0, signal.SIGKILL)
+            process.join()
+        else:
+            code = process.exitcode
         kills.append((after_s, read_events(log)))
-    same = code == 0 and hash_outputs(out) == expected
-    same &= not list(out.parent.glob(f".{out.name}.*"))
+    found = hash_outputs(out)
+    same = code == 0 and found == expected and not list(out.parent.glob(f".{out.name}.*"))
+    if not same:
+        names = found.keys() | expected.keys()
+        differing = sorted(file for file in names if found.get(file) != expected.get(file))
+        print(f"{name}: exit code {code}, differing {differing[:5]}", file=sys.stderr)
+    computed = read_computed(log)
+    log.with_suffix(".computed").unlink(missing_ok=True)
     remove_outputs(out)
+    repeats = len(computed) - len(set(computed)), (), 0.0
     return [
-        Kill(name, after_s, seconds, same, *count_repeated(before, after))
-        for (after_s, before), (_, after) in pairwise(kills)
+        # all images of a chain that were computed again are those of its first kill
+        Kill(name, after_s, seconds, same, *(repeats if number == 0 else (0, (), 0.0)))
+        if again
+        else Kill(name, after_s, seconds, same, *count_repeated(before, after))
+        for number, ((after_s, before), (_, after)) in enumerate(pairwise(kills))
     ]
 
 
 def judge(
-    demo: Path, work: Path, names: Sequence[str], kills: int, seed: int, span: float = 0.5
+    demo: Path,
+    work: Path,
+    names: Sequence[str],
+    kills: int,
+    seed: int,
+    span: float = 0.5,
+    compiled: bool = False,
 ) -> list[Kill]:
     """Kill each command in turn until there are enough kills; print each outcome."""
     rng = np.random.default_rng(seed)
@@ -220,21 +287,30 @@ def judge(
     found: list[Kill] = []
     undisturbed: dict[str, tuple[float, Mapping[str, str]]] = {}
     out = work / "out"
-    for name, (run, _) in runs.items():
-        log = work / "whole.log"
-        for _ in ("compile", "judge"):
-            if start([*run, "--out", str(out)], log).wait() != 0:
-                raise SystemExit(log.read_text())
-            events = read_events(log)
-            undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
-            remove_outputs(out)
+    log = work / "whole.log"
     for name in itertools.cycle(runs):
         if len(found) >= kills:
             break
         run, again = runs[name]
+        for _ in () if name in undisturbed else ("compile", "judge")[compiled:]:
+            process = start([*run, "--out", str(out)], log)
+            process.join()
+            if process.exitcode != 0:
+                raise SystemExit(log.read_text())
+            events = read_events(log)
+            undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
+            log.with_suffix(".computed").unlink(missing_ok=True)
+            remove_outputs(out)
         given_out = [*run, "--out", str(out)]
         chain = kill_until_done(
-            name, given_out, out, whole=undisturbed[name], rng=rng, again=again, span=span
+            name,
+            given_out,
+            out,
+            whole=undisturbed[name],
+            rng=rng,
+            again=again,
+            span=span,
+            most=MAX_KILLS_PER_CHAIN,
         )
         found += chain
         for kill in chain:
@@ -249,19 +325,24 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--span", type=float, default=0.5, help="latest kill, over the run's time")
+    parser.add_argument("--compiled", action="store_true", help="kernels are in the cache")
     parser.add_argument("--commands", default=",".join([*RECONSTRUCTIONS, *SIMULATIONS]))
     parser.add_argument("--work", type=Path, required=True, help="new folder for outputs")
     given = parser.parse_args()
     given.work.mkdir(parents=True)
+    os.environ["SOURCE_DATE_EPOCH"] = str(DATE_EPOCH_S)
     names = given.commands.split(",")
-    found = judge(given.demo, given.work, names, given.kills, given.seed, given.span)
+    found = judge(
+        given.demo, given.work, names, given.kills, given.seed, given.span, given.compiled
+    )
     print("command, kills, same bytes, interrupted parts, complete parts again, their seconds")
     for name in names:
         own = [kill for kill in found if kill.command == name]
         same = sum(kill.same for kill in own)
         parts = sum(kill.interrupted for kill in own), sum(len(kill.left_out) for kill in own)
         print(name, len(own), same, *parts, round(sum(kill.left_out_s for kill in own), 1))
-    return int(any(not kill.same or kill.interrupted > 1 for kill in found))
+    repeated = sum(kill.interrupted for kill in found) > len(found)
+    return int(repeated or any(not kill.same for kill in found))
 
 
 if __name__ == "__main__":

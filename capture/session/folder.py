@@ -28,8 +28,13 @@ _log = logging.getLogger(__name__)
 class DiskErrors:
     """Convert the operating system's errors to session errors that name session and cause."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(
+        self,
+        path: Path,
+        *,
+        advice: str = "Free space or repair the disk, then resume; committed frames are safe.",
+    ) -> None:
+        self._path, self._advice = path, advice
 
     def __enter__(self) -> None:
         return None
@@ -42,9 +47,8 @@ class DiskErrors:
     ) -> None:
         if isinstance(value, OSError) and not isinstance(value, SessionError):
             what = f"the disk refused: {value.strerror or value}"
-            advice = "Free space or repair the disk, then resume; committed frames are safe."
             where, code = str(value.filename or self._path), "SR-SES-013"
-            raise SessionDiskError(what, where=where, advice=advice, code=code) from value
+            raise SessionDiskError(what, where=where, advice=self._advice, code=code) from value
 
 
 def write_new(disk: Disk, path: Path, data: bytes) -> None:

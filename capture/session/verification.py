@@ -1,6 +1,8 @@
 """Verify a session: recompute every hash and seal, and list the differences."""
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -18,11 +20,15 @@ from capture.session.contents import (
     unlisted_files,
 )
 from capture.session.errors import NotASession, SessionError
-from capture.session.journal import FrameLine
+from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.view import check_file
 
 _KNOWN_NAMES = {MANIFEST_FILE, JOURNAL_FILE, FRAMES_FOLDER, ATTACHMENTS_FOLDER, ORPHANS_FOLDER}
 _KNOWN_NAMES |= {"index.sqlite", "ascmhl", SEAL_FILE}
+
+
+N_READERS = 4
+"""Files read at the same time: a disk with a queue is then never idle while hashes are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +51,9 @@ class VerifyReport:
     """Whether a key of the lab has sealed the consent, and whether the seal was checked."""
 
 
-def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
+def verify(
+    path: str | Path, *, today: date | None = None, progress: Callable[[str], None] | None = None
+) -> VerifyReport:
     """Check manifest, journal, every frame and every attachment of a session.
 
     Parameters
@@ -54,6 +62,8 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
         The session's folder.
     today : date, optional
         Day on which consent is evaluated; today by default.
+    progress : callable, optional
+        Called with a line per file.
 
     Returns
     -------
@@ -83,13 +93,7 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
         return VerifyReport(False, (str(exc),), (), 0, 0)
     if contents.walk.damage is not None:
         problems.append(str(contents.walk.damage))
-    frames = size = 0
-    for line in contents.file_lines:
-        try:
-            size += len(check_file(place / line.file, line))
-            frames += isinstance(line, FrameLine)
-        except SessionError as exc:
-            problems.append(str(exc))
+    frames, size = _check_files(place, contents.file_lines, problems, progress)
     unlisted = unlisted_files(place, contents) if contents.walk.damage is None else []
     lost = None if contents.walk.closed else find_lost_lines(place, unlisted)
     if lost is None:
@@ -104,6 +108,39 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
         *(not problems, tuple(problems), tuple(warnings), frames, size, lost is None),
         contents.consent_seal,
     )
+
+
+def _check_files(
+    place: Path,
+    lines: tuple[FrameLine | AttachmentLine, ...],
+    problems: list[str],
+    progress: Callable[[str], None] | None,
+) -> tuple[int, int]:
+    """Check files, several at a time; return the sound frames and the bytes of sound files."""
+
+    def find_problem(line: FrameLine | AttachmentLine) -> str | None:
+        try:
+            check_file(place / line.file, line)
+        except SessionError as exc:
+            return str(exc)
+        return None
+
+    frames = size = 0
+    pool = ThreadPoolExecutor(N_READERS)
+    try:
+        for number, (line, problem) in enumerate(
+            zip(lines, pool.map(find_problem, lines), strict=True), start=1
+        ):
+            if problem is None:
+                size += line.bytes
+                frames += isinstance(line, FrameLine)
+            else:
+                problems.append(problem)
+            if progress is not None:
+                progress(f"check {number}/{len(lines)} files")
+    finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C does not wait for the files that are left
+    return frames, size
 
 
 def _state(place: Path, contents: SessionContents) -> list[str]:

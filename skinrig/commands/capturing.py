@@ -322,7 +322,7 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     from capture.session import verify as check
 
     console = Console(json)
-    found = check(session)
+    found = check(session, progress=console.progress)
     console.print_each("warning", found.warnings)
     console.print_each("damaged", found.problems)
     state = "sound" if found.ok else "DAMAGED" if found.complete else "INCOMPLETE"
@@ -420,3 +420,45 @@ def anonymize(
     )
     figures = select_attributes(found, "path", "frames", "blackened", "removed", "identifiable")
     console.print_document("skinrig.session.anonymize/1", figures)
+
+
+@session_app.command("copy", cls=Command)
+@command
+def copy(
+    session: Path,
+    copy: Path,
+    /,
+    use: str | None = None,
+    verify: bool = False,
+    json: options.Json = False,
+) -> None:
+    """Copy a session to another disk, byte for byte; the same command continues after a stop.
+
+    Every file is checked while it is read; exit code 3 if one is damaged, in the session or in the
+    copy. The copy has the same id, consent and content hash.
+
+    Example: skinrig session copy session /mnt/backup/session --use research --verify
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder, closed, or open as far as its frames are committed.
+    copy
+        New SESSION/ folder.
+    use
+        Purpose of the copy, which the subject's unexpired consent must include.
+    verify
+        Read the copy back from its disk and check every byte.
+    """
+    from skinrig.capturing.second_copy import copy_with_consent
+
+    console = Console(json)
+    found = copy_with_consent(session, copy, use=use, read_back=verify, progress=console.progress)
+    state = "verified" if found.verified else "written"
+    console.print_line(
+        f"{copy}: {state}, {format_count(found.frames, 'frame')}, {found.bytes / 1e6:.1f} MB"
+    )
+    if found.kept:
+        console.print_line(f"{format_count(found.kept, 'file')} of an interrupted copy were sound")
+    names = ("frames", "bytes", "kept", "verified", "content_hash")
+    console.print_document("skinrig.session.copy/1", select_attributes(found, *names))

@@ -152,8 +152,8 @@ def export(
 
     console = Console(json)
     _check_format(to, source, exporting.APPEARANCE_FORMATS, exporting.SESSION_FORMATS)
-    of_session = {"camera": camera, "calibration": calibration}
-    delivery = how.delivery(place=place.position() if to in ("merl", "rgl") else None, **of_session)
+    more = {"camera": camera, "calibration": calibration, "progress": console.progress}
+    delivery = how.delivery(place=place.position() if to in ("merl", "rgl") else None, **more)
     done = exporting.export(source, out, to, delivery, use=use)
     after = NEXT_STEP_BY_FORMAT.get(
         to, "pass the folder on; `ascmhl verify` checks that it is complete and unchanged"

@@ -112,7 +112,7 @@ def export(
     order = delivery or ExportSettings()
     held: SkinAppearance | Session
     if to in SESSION_FORMATS:
-        held = _session(source, use, today)
+        held = _session(source, use, today, order)
     else:
         held = _appearance(source, use, today)
         if to in SURFACE_FORMATS and not any(name in held.maps for name in _DOME_MAPS):
@@ -125,7 +125,10 @@ def export(
         if order.target_face is not None:
             _appearance(order.target_face, use, today)  # its maps are exported, too
     write = load_writer(to)
-    return export_sealed(Path(out), lambda part: write(held, part, order), now)
+    order.report(f"write {to}")
+    return export_sealed(
+        Path(out), lambda part: write(held, part, order), now, progress=order.progress
+    )
 
 
 MAX_LISTED_MAPS = 6
@@ -159,13 +162,15 @@ def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAp
     return appearance
 
 
-def _session(path: str | Path, use: str | None, today: date | None) -> Session:
+def _session(
+    path: str | Path, use: str | None, today: date | None, order: ExportSettings
+) -> Session:
     """Open a session after a check of its digests and of its subject's consent to a use."""
     if use is None:
         raise UsageError("--use: got none; name the purpose of the copy [SR-EXP-001]")
     session = Session.open(path)
     session.require_consent(use, today=today)
-    found = verify(path)
+    found = verify(path, progress=order.progress)
     if not found.ok:
         raise ExportError(
             f"{path}: is damaged, nothing was copied: {found.problems[0]}; restore it from a copy "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -101,6 +101,8 @@ class ExportSettings:
     calibration
         CALIBRATION/ of a session's lights, cameras and sensor; None: the nominal
         rig, with the noise recorded by the frames.
+    progress
+        Called with a line per step, and per frame of a session; None: nothing is called.
     """
 
     unit: str | None = None
@@ -114,6 +116,7 @@ class ExportSettings:
     place: SkinPosition | None = None
     camera: str | None = None
     calibration: Path | None = None
+    progress: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
         """Raise for unknown values and malformed names."""
@@ -127,6 +130,11 @@ class ExportSettings:
         for name in self.only:
             if not _NAME_PATTERN.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names separated by commas")
+
+    def report(self, text: str) -> None:
+        """Report a step that begins, or one part of it as number/count."""
+        if self.progress is not None:
+            self.progress(text)
 
     @property
     def y(self) -> float:

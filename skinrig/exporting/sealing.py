@@ -41,6 +41,8 @@ def export_sealed(
     target: Path,
     write: Callable[[Path], Sequence[tuple[str, str]] | None],
     now: datetime | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
 ) -> ExportResult:
     """Fill a hidden folder by ``write``, seal it, and rename it when it is complete.
 
@@ -52,6 +54,8 @@ def export_sealed(
         Called with an empty folder.
     now
         Date of the manifest; None: the present.
+    progress
+        Called with the name of the last step, before it begins.
 
     Returns
     -------
@@ -61,6 +65,8 @@ def export_sealed(
     moment = now or datetime.now(UTC)
     with replace_folder_atomically(target) as part:  # has the final name, which is in the manifest
         left_out = tuple(write(part) or ())
+        if progress is not None:
+            progress("hash the written files")
         written = [path for path in part.rglob("*") if path.is_file()]
         for path in written:  # the manifest has dates: equal times give equal manifests
             os.utime(path, (moment.timestamp(), moment.timestamp()))

@@ -1,10 +1,13 @@
 """Run plans on simulated rigs and record their sessions and ground truth."""
 
+import hashlib
 import io
-import time
+import shutil
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,15 +15,17 @@ import numpy as np
 
 from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
+from capture.documents import canonical_json, to_json_table
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, SessionError, SubjectRecord, resume_unless_complete
+from capture.session import Session, SessionError, SubjectRecord
+from capture.session.manifest import package_versions
 from model import store
 from model.skin import SkinAppearance
-from rigsim.world import World
 from skinrig.capturing.addresses import open_box
 from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
+from skinrig.console import format_count
 from skinrig.resources.forecast import (
     count_megapixels,
     forecast_resources,
@@ -37,9 +42,13 @@ from skinrig.simulating.orders import (
     SimulationResult,
     truth_folder,
 )
-from skinrig.simulating.resumption import SessionComplete, count_shots, list_refusals
+from skinrig.simulating.replay import ReplayedSession, ReplayedWorld, exposures_folder
+from skinrig.simulating.resumption import SessionComplete, list_refusals
 
 Log = TypeVar("Log", bound=SceneLog)
+
+RUN_ID = "sim1"
+"""Prefix of the tokens of a simulated run; a resumed run is the same run."""
 
 
 def list_effects(scene: Any) -> tuple[Mapping[str, Any], ...]:
@@ -114,7 +123,9 @@ def open_logged_session(
     session = open_session(order, plan, rig, settings, scene)
     with release_on_error(session):
         truth = truth_folder(order.out)
-        require_unfinished(order, session, scene, kind.path_of(truth))
+        log_path = kind.path_of(truth)
+        require_unfinished(order, session, scene, log_path)
+        require_exposures_of_log(session, log_path)
         return session, kind(scene, truth, resume=order.resume, session=session)
 
 
@@ -130,12 +141,24 @@ def require_unfinished(
         raise SessionComplete(build_result(order, session, scene, 0.0, truth))
 
 
+def require_exposures_of_log(session: Session, log_path: Path) -> None:
+    """Forget the stored images of a session if the log of their exposures is missing.
+
+    Exposures are logged when they are computed; without these images they are computed again.
+    """
+    if isinstance(session, ReplayedSession) and not log_path.is_file():
+        session.exposures.clear()
+
+
 def open_session(
     order: SimulationOrder, plan: Plan, rig: Rig, settings: Mapping[str, Any], scene: Any
 ) -> Session:
     """Create the session of an order, or resume it if its settings are the same."""
     if order.resume:
-        session = resume_unless_complete(order.out)
+        opened = Session.open(order.out)
+        session = opened if opened.complete else ReplayedSession.resume(order.out)
+        if opened.complete:
+            shutil.rmtree(exposures_folder(order.out), ignore_errors=True)
         lines = list_refusals(session, settings, order.seed, order.person)
         if lines:
             session.release()
@@ -146,8 +169,13 @@ def open_session(
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)
+    if not order.out.exists():
+        shutil.rmtree(exposures_folder(order.out), ignore_errors=True)
     created = order.captured_at
-    return Session.create(
+    subject = order.person or SubjectRecord(
+        subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES
+    )
+    return ReplayedSession.create(
         order.out,
         plan=plan,
         rig=rig,
@@ -155,8 +183,7 @@ def open_session(
             **{name: f"rigsim {name} box" for name in rig.boxes},
             **{view.name: view.serial for view in rig.all_views},
         },
-        subject=order.person
-        or SubjectRecord(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
+        subject=subject,
         source="simulated",
         seed=order.seed,
         extra={
@@ -164,8 +191,36 @@ def open_session(
             "effects": [dict(one) for one in list_effects(scene)],
             "renderer": record_renderer(scene),
         },
-        now=None if created is None else (lambda: created),
+        session_id=derive_session_id(created, order.seed, settings, subject),
+        now=lambda: created,
     )
+
+
+def derive_session_id(
+    created: datetime, seed: int, settings: Mapping[str, Any], subject: SubjectRecord
+) -> str:
+    """Return the id of a simulated session, by all that determines its frames and its date.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+
+    Examples
+    --------
+    >>> from datetime import UTC, datetime
+    >>> subject = SubjectRecord("P1", ("research",))
+    >>> derive_session_id(datetime(2026, 1, 1, tzinfo=UTC), 3, {"rig": "flash"}, subject)[:8]
+    'ID8'
+    """
+    content = {
+        "created_at": created.isoformat(),
+        "seed": seed,
+        "settings": dict(settings),
+        "subject": to_json_table(subject),
+        "versions": package_versions(),
+    }
+    return hashlib.sha256(canonical_json(content)).hexdigest()[:32]
 
 
 def require_room(order: SimulationOrder, rig: Rig, plan: Plan) -> None:
@@ -270,8 +325,6 @@ def drive_plan(
     prompt: Callable[[Any, str], None] | None = None,
     *,
     signal: Callable[[Any, str], None] | None = None,
-    begun_s: float | None = None,
-    run_id: str | None = None,
     **run: Any,
 ) -> float:
     """Run a session's plan through the drivers in a world registered under its id, and close it.
@@ -288,11 +341,6 @@ def drive_plan(
         Called with the world and the instruction to the operator; None: prompts are ignored.
     signal
         Called with the world and the expression that a sequence requests, at that time.
-    begun_s
-        Host time at which the world begins, s since 1970; None: the host's clock is this
-        computer's, not the world's.
-    run_id
-        See `capture.acquire.Operator`; None: a new one.
     run
         Further arguments of `capture.acquire.run_plan`: ``eyes``, ``force_limit_n``,
         ``all_brackets``.
@@ -306,15 +354,20 @@ def drive_plan(
         if order.progress is not None:
             order.progress("complete: nothing is left to capture")
         return 0.0
-    world = World(
+    if not isinstance(session, ReplayedSession):
+        raise TypeError(f"session: got {type(session).__name__}, expected ReplayedSession")
+    if session.recorded_count and order.progress is not None:
+        order.progress(f"replay {format_count(session.recorded_count, 'recorded line')}")
+    world = ReplayedWorld(
         rig,
         seed=order.noise_seed,
         subject_seed=order.seed,
         clock="virtual",
         scene=scene,
-        shots_made=count_shots(session),
+        session=session,
     )
-    name = world.register(session.id)
+    begun_s = session.manifest.created_at.timestamp()
+    name = world.register(uuid.uuid4().hex)
     boxes = {
         # a fixed first number: random ones vary in length, and so would the time of a transfer
         kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
@@ -326,10 +379,10 @@ def drive_plan(
         prompt=lambda text: None if prompt is None else prompt(world, text),
         signal=lambda state: None if signal is None else signal(world, state),
         timer=world.clock,
-        clock=time.time if begun_s is None else lambda: begun_s + world.now,
+        # the host's clock is the world's: a resumed run has the times of an undisturbed one
+        clock=lambda: begun_s + world.now,
+        run_id=RUN_ID,
     )
-    if run_id:
-        operator = replace(operator, run_id=run_id)
     try:
         run_plan(
             session.plan,

@@ -28,6 +28,7 @@ class ExposureLog:
         self._path = path
         if not resume:
             path.unlink(missing_ok=True)
+        path.touch()  # a missing log is a lost one
 
     def add(self, entry: Mapping[str, Any]) -> None:
         """Append an entry."""
@@ -48,7 +49,9 @@ class ExposureLog:
 
 
 class SceneLog(ExposureLog):
-    """Scene wrapper that logs the world's state at each exposure, with the number of the run.
+    """Scene wrapper that logs the world's state at each exposure.
+
+    A resumed simulation replays the run, so that an entry may occur twice, with equal values.
 
     Parameters
     ----------
@@ -85,23 +88,17 @@ class SceneLog(ExposureLog):
                 f"{self._path}: is missing, so the ground truth of {self.lost_label} is lost; "
                 "simulate a new session"
             )
-        self._run = 1 + max((int(entry["run"]) for entry in entries), default=0)
 
     @classmethod
     def path_of(cls, truth: Path) -> Path:
         """Return the path of the log of a ground truth's folder."""
         return truth.with_name(f".{truth.name}.{cls.suffix}.jsonl")
 
-    @property
-    def run_id(self) -> str:
-        """Prefix of the tokens of this run."""
-        return f"sim{self._run}"
-
     def exposure(self, view_name: str, *, pops: Sequence[Any], **exposed: Any) -> Any:
         """Expose the scene; log the state if a light was on."""
         state = self.describe_exposure(exposed) if pops else None
         if state is not None:
-            self.add({"run": self._run, "t_s": pops[0].t_on_s, **state})
+            self.add({"t_s": pops[0].t_on_s, **state})
         return self._scene.exposure(view_name, pops=pops, **exposed)
 
     def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -109,17 +106,17 @@ class SceneLog(ExposureLog):
         raise NotImplementedError
 
     def at(
-        self, entries: Sequence[Mapping[str, Any]], run_id: str, record: FrameRecord, label: str
+        self, entries: Sequence[Mapping[str, Any]], record: FrameRecord, label: str
     ) -> Mapping[str, Any]:
-        """Return the entry of a frame in a run.
+        """Return the entry of a frame.
 
         Raises
         ------
         SimulationError
             If the log has no entry within `max_lag_s` of the frame.
         """
-        run, time_s = int(run_id.removeprefix("sim")), float(record.line.t_box_s or 0.0)
+        time_s = float(record.line.t_box_s or 0.0)
         for entry in entries:
-            if entry["run"] == run and abs(entry["t_s"] - time_s) < self.max_lag_s:
+            if abs(entry["t_s"] - time_s) < self.max_lag_s:
                 return entry
         raise SimulationError(f"{self._path}: has no entry for {label}; simulate a new session")

@@ -65,7 +65,7 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
     )
     session, log = driving.open_logged_session(order, plan, rig, asked, scene, GripLog)
     rig_seconds = driving.drive_plan(
-        order, session, rig, log, eyes="closed", force_limit_n=FORCE_LIMIT_N, run_id=log.run_id
+        order, session, rig, log, eyes="closed", force_limit_n=FORCE_LIMIT_N
     )
     truth = None
     if order.target is None:
@@ -189,7 +189,6 @@ class GripLog(SceneLog):
                 if record.step_id in ids and record.settings["pattern"] != "dark"
             )
             if (first := next(lit, None)) is not None:
-                run_id = str(first.actual["token"]).partition(".")[0]
-                entry = self.at(entries, run_id, first, f"state {name}")
+                entry = self.at(entries, first, f"state {name}")
                 found.append(GripState(**entry["grip"]))
         return found

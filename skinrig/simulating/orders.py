@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
@@ -17,6 +17,7 @@ from rigsim.mitsuba.variant import Renderer
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, require_choice
 from skinrig.simulating.effect_omission import omission_arguments
+from skinrig.source_date import read_clock
 
 PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
@@ -123,7 +124,7 @@ class SimulationOrder:
     resume: bool = False
     """Resume an interrupted session; its frames are kept."""
     created: datetime | None = None
-    """Date of the session; None: now, less `days_ago`."""
+    """Date of the session; None: now, less `days_ago`; see `read_clock`."""
     person: SubjectRecord | None = None
     """Pseudonym and consent to record; None: consent to :data:`SIMULATED_USES`, or that of the
     resumed session. A record that differs from the resumed session's is refused."""
@@ -168,11 +169,9 @@ class SimulationOrder:
         return self.seed if self.session_seed is None else self.session_seed
 
     @property
-    def captured_at(self) -> datetime | None:
-        """Date of the session; None: now."""
-        if self.created is not None or not self.days_ago:
-            return self.created
-        return datetime.now(UTC) - timedelta(days=self.days_ago)
+    def captured_at(self) -> datetime:
+        """Date of the session: `created`, or now less `days_ago`."""
+        return self.created or read_clock() - timedelta(days=self.days_ago)
 
     @property
     def rig_age(self) -> RigAge:

@@ -44,9 +44,7 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
     light = driving.announce_light(plan, rig, order)
     session, log = driving.open_logged_session(order, plan, rig, asked, scene, HeadLog)
     # nobody places the head: a placement is sent to the controller, which passes it to the world
-    rig_seconds = driving.drive_plan(
-        order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
-    )
+    rig_seconds = driving.drive_plan(order, session, rig, log, all_brackets=order.all_brackets)
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
@@ -150,8 +148,7 @@ class HeadLog(SceneLog):
         for placement, steps in group_by_series(session.plan):
             for step in steps:
                 if step.kind != "mask" and (record := frames.get(step.id)) is not None:
-                    run_id = str(record.actual["run"])
-                    entry = self.at(entries, run_id, record, f"step {step.id}")
+                    entry = self.at(entries, record, f"step {step.id}")
                     suctions.setdefault(placement, []).append(float(entry["suction_mbar"]))
         return [
             ProbePlacement(head.site, head.repeat, head.angle_deg, sum(mbar) / len(mbar))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from skinrig.simulating.driving import (
     build_result,
     drive_plan,
     open_session,
+    require_exposures_of_log,
     require_room,
     require_unfinished,
     session_settings,
@@ -54,8 +54,6 @@ COURSE_LANDMARKS = {
 """The five positions of Jimenez et al. 2010, figure 7, with their landmarks."""
 DISC_RADIUS_FRACTION = 0.02
 """Radius of the disc at a position, as a fraction of the image width."""
-INTERRUPTION_S = 10.0
-"""Duration of a simulated interruption on the host's clock, s."""
 
 
 def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationResult:
@@ -120,11 +118,8 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     session = open_session(order, plan, rig, asked, scene)
     log_path = truth.with_name(f"{truth.name}.flashes.jsonl")
     require_unfinished(order, session, scene, log_path)
+    require_exposures_of_log(session, log_path)
     log = ExposureLog(log_path, resume=order.resume)
-    before_s = _event_s(session)
-    begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
-    if before_s is not None and not sequence.is_prompted:
-        course.prompt(before_s - begun_s, sequence.state)  # the event ended before this world began
 
     def prompt(world: Any, text: str) -> None:
         if text == sequence.state:
@@ -133,24 +128,12 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     def signal(world: Any, text: str) -> None:
         course.prompt(world.now, text)
 
-    rig_seconds = drive_plan(order, session, rig, scene, prompt, signal=signal, begun_s=begun_s)
+    rig_seconds = drive_plan(order, session, rig, scene, prompt, signal=signal)
     about = subject_records.truth_parameters(order.subject, "flash", order.progress)
     flashes = {str(entry["token"]): entry for entry in log.read()}
     _write_truth(truth, scene, session, sequence, flashes, seed, about)
     log.remove()
     return build_result(order, session, scene, rig_seconds, truth)
-
-
-def _event_s(session: Session) -> float | None:
-    """Return the host time of a sequence's time 0, s; None before its first frame."""
-    for record in session.frames("subject"):
-        if "time_s" in record.line.actual:
-            return record.line.t_host_s - float(record.line.actual["time_s"])
-    return None
-
-
-def _last_s(session: Session) -> float:
-    return max(record.line.t_host_s for record in session.frames())
 
 
 def _write_truth(

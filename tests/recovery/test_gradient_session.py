@@ -124,13 +124,12 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
     assert verify(out).ok
     assert session.omitted_steps() == {}
     cut, whole = (store.read(path).parameters["states"] for path in (again.truth, made.truth))
-    # the same skin and tape, taped twice: the same stretches
-    assert [row["name"] for row in cut] == [row["name"] for row in whole]
-    for a, b in zip(cut, whole, strict=True):
-        assert a["stretch_s"] == pytest.approx(b["stretch_s"], abs=1e-9)
-        assert a["shift_mm"] == b["shift_mm"]
-    tapings = {strain_state(r.step): r.actual["attachment"] for r in session.frames("gradient")}
-    assert tapings["a000_p1"] == 2
+    assert cut == whole  # the run is replayed: skin is not taped again
+    tapings = {
+        path: {strain_state(r.step): r.actual["attachment"] for r in frames("gradient")}
+        for path, frames in ((out, session.frames), (made, Session.open(made.session).frames))
+    }
+    assert tapings[out] == tapings[made]
 
 
 def test_truth_with_lost_log_is_not_invented(made, tmp_path):

@@ -83,6 +83,7 @@ UNREADABLE = {
     "study": ["--out a", "file.txt", "a b --out c"],
     "soak": ["--hours long", "extra"],
     "session seal": ["", "a b"],
+    "session copy": ["s", "folder copy --verify", "a b c"],
     "session anonymize": [
         "s",
         "folder --out a --landmarks cam",
@@ -149,6 +150,7 @@ UNUSABLE = {
     "bench": ["--stage coffee", "--budget 0", "--out file.txt"],
     "soak": ["--hours -1", "--first-day -1", "--budget 0", "--seed -1"],
     "session seal": ["none", "file.txt", "folder"],
+    "session copy": ["none copy --use research", "folder copy --use research"],
     "session anonymize": [
         "none --drop-images --out a",
         "folder --drop-images --out a",

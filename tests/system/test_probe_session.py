@@ -174,7 +174,7 @@ def test_simulation_resumed_mid_series_has_complete_truth(tmp_path, monkeypatch)
     assert verify(out).ok
     assert {r.attempt for r in session.frames()} == {1}
     runs = {r.index["site"]: r.actual["run"] for r in session.frames("fibers")}
-    assert runs == {"forehead": "sim1", "cheek": "sim2"}
+    assert runs == {"forehead": "sim1", "cheek": "sim1"}  # the run is replayed
     sites = [p["site"] for p in store.read(tmp_path / "truth-probe").parameters["profiles"]]
     assert sites == ["forehead", "cheek"]
     assert main([*words, "--resume"]) == errors.EXIT_DONE  # complete, its log is removed

@@ -42,14 +42,18 @@ def write_session(session: Session, out: Path, delivery: ExportSettings) -> None
         if (session.path / folder).is_dir():
             (out / folder).mkdir()
     # all attempts of frames, not only the last, since the journal lists them
-    for line in read_undamaged_contents(session.path).file_lines:
+    lines = read_undamaged_contents(session.path).file_lines
+    for number, line in enumerate(lines, start=1):
+        delivery.report(f"write {number}/{len(lines)} files")
         (out / line.file).write_bytes(check_file(session.path / line.file, line))
 
 
 def write_frames(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy the DNG files alone."""
     (out / FRAMES_FOLDER).mkdir()
-    for record in session.frames():
+    records = session.frames()
+    for number, record in enumerate(records, start=1):
+        delivery.report(f"write {number}/{len(records)} frames")
         (out / record.file).write_bytes(check_file(session.path / record.file, record.line))
 
 

@@ -119,7 +119,10 @@ def arrange_steps(session: Session) -> Iterator[StepCube]:
 
 
 def read_cube(
-    cube: StepCube, session: Session, create_image: CreateImage
+    cube: StepCube,
+    session: Session,
+    create_image: CreateImage,
+    report_frame: Callable[[], None] = lambda: None,
 ) -> dict[str, LabelledArray]:
     """Return images, masks, coordinates and reported values of the steps of a cube.
 
@@ -133,6 +136,8 @@ def read_cube(
         Any session.
     create_image
         Called once, when the first frame was read.
+    report_frame
+        Called before each frame.
 
     Raises
     ------
@@ -159,6 +164,7 @@ def read_cube(
         if record.step_id in ids and record.camera in cube.cameras
     }
     for cell, record in records.items():
+        report_frame()
         frame = session.read(record)
         if "image" not in found:
             wide = frame.white >= FILL_CODE

@@ -6,6 +6,8 @@ is one chunk, so that a session of any size is written and read frame by frame.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -32,7 +34,7 @@ def write(session: Session, out: Path, delivery: ExportSettings) -> list[tuple[s
     out
         Existing folder; the store is `STORE_FOLDER` in it.
     delivery
-        Not used: frames are copied without any change.
+        Only its `report` is used: frames are copied without any change.
 
     Returns
     -------
@@ -63,8 +65,14 @@ def write(session: Session, out: Path, delivery: ExportSettings) -> list[tuple[s
         "versions": dict(manifest.versions),
     }
     root = zarr.create_group(out / STORE_FOLDER, zarr_format=3, attributes=about)
+    total = len(session.frames())
+    numbers = itertools.count(1)
+
+    def report_frame() -> None:
+        delivery.report(f"write {next(numbers)}/{total} frames")
+
     for cube in arrange_steps(session):
-        _write_cube(root.create_group(cube.name), cube, session)
+        _write_cube(root.create_group(cube.name), cube, session, report_frame)
     kept = "remains in the session; `skinrig export --to mhl` copies it"
     left_out = [(name, kept) for name in session.attachments()]
     steps: dict[str, list[str]] = {}
@@ -76,7 +84,9 @@ def write(session: Session, out: Path, delivery: ExportSettings) -> list[tuple[s
     ]
 
 
-def _write_cube(group: Group, cube: StepCube, session: Session) -> None:
+def _write_cube(
+    group: Group, cube: StepCube, session: Session, report_frame: Callable[[], None]
+) -> None:
     """Write the arrays of one kind of step; frames go to the disk one by one."""
     axes = tuple(cube.labels)
 
@@ -90,7 +100,7 @@ def _write_cube(group: Group, cube: StepCube, session: Session) -> None:
             dimension_names=(*axes, *PIXEL_AXES),
         )
 
-    for name, one in read_cube(cube, session, create_image).items():
+    for name, one in read_cube(cube, session, create_image, report_frame).items():
         if name == "image":
             one.values.update_attributes(dict(one.attributes))
             continue
