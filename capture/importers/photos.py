@@ -11,7 +11,8 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.framing import Framing
-from capture.importers.images import Encoding, Photo, PhotoError, read_photo
+from capture.importers.image_checks import VIDEO_SUFFIXES, PhotoError
+from capture.importers.images import Encoding, Photo, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
@@ -32,8 +33,9 @@ IMPORTED_RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
 RAW_CURVES = "Nikon 5100 (NPL)"  # assumed for a camera without a measured sensitivity
 IMAGE_CURVES = "linear sRGB"
-SIDECAR_SUFFIXES = frozenset(
-    ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
+SIDECAR_SUFFIXES = VIDEO_SUFFIXES | frozenset(
+    ".txt .md .csv .json .npy .xmp .aae .thm .pp3 .dop .xml .html .pdf .doc .docx .xlsx .zip .lp .db"
+    " .ini".split()
 )
 UNEQUAL_PAIR_NOTE = "differ in color or size, so that no specular image follows from them"
 """End of an assumption that begins with the names of two files."""
