@@ -13,8 +13,10 @@ MAX_IMAGE_SIDE_PX = 32_767
 _IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
 
 
+VIDEO_ADVICE = "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
+CONVERSION_ADVICE = "Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW."
 VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
-CR3_BRAND = b"crx "
+VIDEO_BRANDS = (b"isom", b"mp42", b"qt  ", b"avc1", b"M4V ")
 OTHER_KINDS = {
     "HEIC image": ((b"heic", b"heix", b"mif1", b"msf1"), (".heic", ".heif")),
     "AVIF image": ((b"avif",), (".avif",)),
@@ -185,17 +187,19 @@ def require_photograph(file: Path, head: bytes) -> None:
     suffix = file.suffix.lower()
     brand = head[8:12] if head[4:8] == b"ftyp" else b""
     kind = next(
-        (name for name, (brands, suffixes) in OTHER_KINDS.items()
-         if brand in brands or head.startswith(brands) or (suffix in suffixes)),
-        None,
-    )  # fmt: skip
-    if kind is None or (brand == CR3_BRAND):
+        (
+            name
+            for name, (brands, suffixes) in OTHER_KINDS.items()
+            if brand in brands or head.startswith(brands) or suffix in suffixes
+        ),
+        "video" if suffix in VIDEO_SUFFIXES or brand in VIDEO_BRANDS else None,
+    )
+    if kind is None:
         return
     raise PhotoError(
         f"is a {kind}",
         where=str(file),
-        faults=[Fault("format", kind, "RAW, TIFF, OpenEXR, PNG or JPEG")],
-        advice=advise_conversion(file.name),
+        advice=VIDEO_ADVICE if kind == "video" else CONVERSION_ADVICE,
         code="SR-IMP-014",
     )
 
@@ -212,7 +216,7 @@ def advise_conversion(name: str) -> str:
     """
     suffix = Path(name).suffix.lower()
     if suffix in VIDEO_SUFFIXES:
-        return "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
+        return VIDEO_ADVICE
     if suffix in OTHER_IMAGE_SUFFIXES:
-        return "Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW."
+        return CONVERSION_ADVICE
     return ""
