@@ -126,8 +126,8 @@ def _relight(
         residual = values - rows @ light
         spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
         weights = np.maximum(1.0 - (residual / (TUKEY_CONSTANT * spread)) ** 2, 0.0) ** 2
-    half = light / max(float(np.linalg.norm(light)), 1e-12) + (0.0, 0.0, 1.0)
-    half /= max(float(np.linalg.norm(half)), 1e-12)
+    half = light / max(float(np.linalg.norm(light)), 1e-12) + np.array([0.0, 0.0, 1.0])
+    half = np.asarray(half / max(float(np.linalg.norm(half)), 1e-12), np.float64)
     albedo = np.linalg.norm(scaled_normals, axis=-1)
     mirrors = scaled_normals @ half > MAX_MIRROR_COSINE * albedo
     return np.asarray(np.maximum(scaled_normals @ light, 0.0)), np.asarray(mirrors)
