@@ -18,7 +18,7 @@ from fixtures import faulty_patterns  # type: ignore[import-not-found]
 from fixtures.faulty_stacks import TONES  # type: ignore[import-not-found]
 
 from reconstruction.stack_diagnosis.pattern_faults import (
-    PATTERNS,
+    PATTERN_NAMES,
     find_exchanged_pair,
     find_pattern_faults,
 )
@@ -35,7 +35,7 @@ def judge(kind: str, fault: str, seed: int, tone: str) -> tuple[bool, bool]:
         return bool(found), bool(found) and bool(fault)
     images, inside, names = faulty_patterns.make_patterns(fault, seed, tone=tone)
     found = list(find_pattern_faults(images, inside))
-    numbers = tuple(sorted(PATTERNS.index(name) for name in names))
+    numbers = tuple(sorted(PATTERN_NAMES.index(name) for name in names))
     return bool(found), any(one.frames == numbers for one in found)
 
 

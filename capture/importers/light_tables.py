@@ -16,7 +16,7 @@ from capture.documents import Fault, InputError, read_json
 MAX_BYTES = 2**24
 VECTOR_KEYS = ("direction", "dir", "light_dir", "position", "pos", "light_pos", "xyz", "vector")
 NAME_KEYS = ("image", "file", "filename", "file_path", "name", "frame")
-AXES = ("x", "y", "z")
+AXIS_NAMES = ("x", "y", "z")
 """Ends of the names of columns."""
 COMMENT_MARKS = ("#", "%", "//")
 LIST_KEYS = ("lights", "frames", "images", "light_directions", "light_positions", "directions")
@@ -62,7 +62,7 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
         if line.strip() and not line.lstrip().startswith(COMMENT_MARKS)
     ]
     heads = [word.strip().casefold() for word in rows[0][1][-3:]] if rows else []
-    if len(heads) == 3 and all(map(str.endswith, heads, AXES)):
+    if len(heads) == 3 and all(map(str.endswith, heads, AXIS_NAMES)):
         return rows[1:]
     return rows
 

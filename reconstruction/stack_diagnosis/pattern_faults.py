@@ -14,8 +14,8 @@ from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.stack_diagnosis.axis_faults import find_axes
 from reconstruction.stack_diagnosis.finding import Finding
 
-AXES = ("x", "y", "z")
-PATTERNS = ("full", "x", "y", "z", "-x", "-y", "-z")
+AXIS_NAMES = ("x", "y", "z")
+PATTERN_NAMES = ("full", "x", "y", "z", "-x", "-y", "-z")
 SMOOTHING_PX = 1.5
 """Standard deviation of the filter that lowers noise before images are subtracted."""
 MIN_LIGHT = 0.2
@@ -73,12 +73,12 @@ def find_pattern_faults(images: Mapping[str, FloatArray], inside: BoolArray) -> 
     """Yield gradient patterns that are missing, empty, exchanged or inconsistent.
 
     A pattern and its inverse add up to the full light. Exchanged axes and signs keep these sums:
-    then the moments are not the normals of a surface. Frames of findings count `PATTERNS`.
+    then the moments are not the normals of a surface. Frames of findings count `PATTERN_NAMES`.
 
     Parameters
     ----------
     images
-        (H, W) by the names of `PATTERNS`, linear samples at one exposure, without dark signal; a
+        (H, W) by the names of `PATTERN_NAMES`, linear samples at one exposure, without dark signal; a
         series without any inverse is complete.
     inside
         (H, W), the object.
@@ -90,11 +90,11 @@ def find_pattern_faults(images: Mapping[str, FloatArray], inside: BoolArray) -> 
     """
     checks = Checks(PhotometricStereoError)
     for name in images:
-        checks.require(name in PATTERNS, "images", repr(name), ", ".join(PATTERNS))
+        checks.require(name in PATTERN_NAMES, "images", repr(name), ", ".join(PATTERN_NAMES))
     _require_equal_shapes(images, inside)
     lacking = list(_find_missing(images, inside))
     yield from lacking
-    if lacking or not inside.any() or len(images) < len(PATTERNS):
+    if lacking or not inside.any() or len(images) < len(PATTERN_NAMES):
         return
     smooth = {
         name: _smooth(np.asarray(image, np.float64), inside) for name, image in images.items()
@@ -108,18 +108,18 @@ def find_pattern_faults(images: Mapping[str, FloatArray], inside: BoolArray) -> 
     if found is not None:
         worst = max(errors.values())
         yield Finding(
-            "exchanged patterns", tuple(sorted(PATTERNS.index(name) for name in found)),
+            "exchanged patterns", tuple(sorted(PATTERN_NAMES.index(name) for name in found)),
             f"pattern and inverse differ from the full light by {worst:.0%}, and by less than "
             f"{MAX_SUM_ERROR:.0%} with {found[0]} and {found[1]} exchanged",
             worst, MAX_SUM_ERROR, f"exchange the images {found[0]} and {found[1]}",
         )  # fmt: skip
         return
     names = [name for axis in wrong for name in (axis, f"-{axis}")]
-    if len(wrong) == len(AXES):  # one image is in all three sums
+    if len(wrong) == len(AXIS_NAMES):  # one image is in all three sums
         names = ["full"]
     worst = max(errors.values())
     yield Finding(
-        "inconsistent patterns", tuple(sorted(PATTERNS.index(name) for name in names)),
+        "inconsistent patterns", tuple(sorted(PATTERN_NAMES.index(name) for name in names)),
         f"pattern and inverse differ from the full light by {worst:.0%}: one of "
         f"{', '.join(names)} has another exposure, or the object moved",
         worst, MAX_SUM_ERROR, f"take {', '.join(names)} again",
@@ -135,7 +135,7 @@ def _require_equal_shapes(images: Mapping[str, FloatArray], inside: BoolArray) -
 
 def _find_missing(images: Mapping[str, FloatArray], inside: BoolArray) -> Iterator[Finding]:
     """Yield patterns that are not there, and those without light."""
-    series = PATTERNS if any(name.startswith("-") for name in images) else PATTERNS[:4]
+    series = PATTERN_NAMES if any(name.startswith("-") for name in images) else PATTERN_NAMES[:4]
     for number, name in enumerate(series):
         if name not in images:
             yield Finding(
@@ -149,7 +149,7 @@ def _find_missing(images: Mapping[str, FloatArray], inside: BoolArray) -> Iterat
     for name, value in light.items():
         if value < MIN_PATTERN_LIGHT * full:
             yield Finding(
-                "empty pattern", (PATTERNS.index(name),),
+                "empty pattern", (PATTERN_NAMES.index(name),),
                 f"the image of {name} has {value / full:.1%} of the full light",
                 1.0 - value / full, 1.0 - MIN_PATTERN_LIGHT, f"take the pattern {name} again",
             )  # fmt: skip
@@ -175,20 +175,20 @@ def _sum_errors(images: Mapping[str, Float64Array], inside: BoolArray) -> dict[s
                 SUM_QUANTILE,
             )
         )
-        for axis in AXES
+        for axis in AXIS_NAMES
     }
 
 
 def _moments(images: Mapping[str, Float64Array]) -> Float64Array:
     """Return unit vectors along the moments of the light, (H, W, 3)."""
-    moments = np.stack([images[axis] - images[f"-{axis}"] for axis in AXES], axis=-1)
+    moments = np.stack([images[axis] - images[f"-{axis}"] for axis in AXIS_NAMES], axis=-1)
     return unit_vectors(moments, min_length=1e-9)
 
 
 def _find_exchange(images: Mapping[str, Float64Array], inside: BoolArray) -> tuple[str, str] | None:
     """Return the two images whose exchange makes all sums right, and the moments normals."""
     right = []
-    for one, other in combinations(PATTERNS, 2):
+    for one, other in combinations(PATTERN_NAMES, 2):
         tried = dict(images) | {one: images[other], other: images[one]}
         if max(_sum_errors(tried, inside).values()) < MAX_SUM_ERROR:
             turned = bool(list(find_axes(_moments(tried), inside)))
@@ -200,10 +200,10 @@ def _find_turned(images: Mapping[str, Float64Array], inside: BoolArray) -> Itera
     """Yield the axes whose patterns are exchanged with each other or with their inverse."""
     for one in find_axes(_moments(images), inside):
         read = one.remedy.rsplit("(", 1)[1].rstrip(")").split(", ")
-        axes = sorted({axis for axis, term in zip(AXES, read, strict=True) if term != axis})
+        axes = sorted({axis for axis, term in zip(AXIS_NAMES, read, strict=True) if term != axis})
         names = [name for axis in axes for name in (axis, f"-{axis}")]
         yield Finding(
-            "exchanged patterns", tuple(sorted(PATTERNS.index(name) for name in names)),
+            "exchanged patterns", tuple(sorted(PATTERN_NAMES.index(name) for name in names)),
             one.evidence, one.measured, one.limit,
             f"read the patterns (x, y, z) as ({', '.join(read)}); -x is the inverse of x",
         )  # fmt: skip

@@ -36,7 +36,7 @@ def test_faulty_pattern_is_named_in_any_unit(seed, tone, fault, unit):
     images, inside, names = make_patterns(fault, seed, tone=tone, side=48)
     images = {name: unit * image for name, image in images.items()}
     found = list(pattern_faults.find_pattern_faults(images, inside))
-    numbers = tuple(sorted(pattern_faults.PATTERNS.index(name) for name in names))
+    numbers = tuple(sorted(pattern_faults.PATTERN_NAMES.index(name) for name in names))
     assert numbers in [one.frames for one in found]
 
 
@@ -45,7 +45,7 @@ def test_faulty_pattern_is_named_in_any_unit(seed, tone, fault, unit):
 def test_sound_patterns_have_no_finding(seed, tone):
     images, inside, _ = make_patterns("", seed, tone=tone, side=48)
     assert not list(pattern_faults.find_pattern_faults(images, inside))
-    four = {name: images[name] for name in pattern_faults.PATTERNS[:4]}
+    four = {name: images[name] for name in pattern_faults.PATTERN_NAMES[:4]}
     assert not list(pattern_faults.find_pattern_faults(four, inside))
     nothing = np.zeros(inside.shape, bool)
     assert not list(pattern_faults.find_pattern_faults(images, nothing))
@@ -54,7 +54,7 @@ def test_sound_patterns_have_no_finding(seed, tone):
 def test_flipped_axis_of_ball_is_named():
     images, inside, names = make_patterns("x and -x", 2, side=48)  # seed 2: a ball
     (one,) = pattern_faults.find_pattern_faults(images, inside)
-    assert one.frames == tuple(sorted(pattern_faults.PATTERNS.index(name) for name in names))
+    assert one.frames == tuple(sorted(pattern_faults.PATTERN_NAMES.index(name) for name in names))
     assert "(-x, y, z)" in one.remedy
 
 
