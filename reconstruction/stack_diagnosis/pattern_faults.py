@@ -21,7 +21,7 @@ SMOOTHING_PX = 1.5
 MIN_LIGHT = 0.2
 """Of the bright samples; darker ones are not compared."""
 MIN_EXCHANGED, EXCHANGED_RATIO = 0.02, 2.0
-"""Light of the crossed image above the parallel one: over the bright level, over its opposite."""
+"""Light of the crossed image above the parallel one, over the bright level and its opposite."""
 TAIL_QUANTILE = 0.99
 SUM_QUANTILE, MAX_SUM_ERROR = 0.9, 0.05
 """Quantile of the difference of pattern and inverse to the full light, relative, and its limit."""
@@ -78,8 +78,8 @@ def find_pattern_faults(images: Mapping[str, FloatArray], inside: BoolArray) -> 
     Parameters
     ----------
     images
-        (H, W) by the names of `PATTERN_NAMES`, linear samples at one exposure, without dark signal; a
-        series without any inverse is complete.
+        (H, W) by the names of `PATTERN_NAMES`, linear samples at one exposure, without dark
+        signal; a series without any inverse is complete.
     inside
         (H, W), the object.
 
