@@ -26,6 +26,9 @@ TUKEY_CONSTANT, MAX_RESIDUAL = 4.7, 4.0
 """Residual in standard deviations beyond which a sample fits no matte light, and is left out."""
 N_FIT_STEPS, N_SHIFT_STEPS = 8, 6
 MIN_SAMPLES = 100
+MIN_MISFIT = 0.03
+"""Robust deviation from the best matte light, over its median, below which nothing has moved: a
+smooth surface of one albedo has no fine structure but noise."""
 MIN_CORRELATION, MIN_GAIN = 0.5, 0.1
 """Correlation of the fine structure of a mirrored image, and its gain over the straight one."""
 MIN_SHIFT_PX, MAX_STEP_PX = 0.7, 2.0
@@ -37,12 +40,13 @@ MIN_SHIFT_GAIN = 0.02
 
 
 class FineStructure(NamedTuple):
-    """Fine structure of an image and of its prediction, (H, W) each, and their correlation."""
+    """Fine structure of an image and of its prediction, (H, W), their correlation and misfit."""
 
     image: Float64Array
     predicted: Float64Array
     weights: Float64Array
     correlation: float
+    misfit: float
 
 
 def find_moved(
@@ -62,6 +66,8 @@ def find_moved(
     for number, image in enumerate(gray):
         good = inside & usable[number]
         straight = _compare(image, good, scaled_normals)
+        if straight.misfit < MIN_MISFIT:
+            continue
         mirrored = straight.correlation
         if mirrored < 1.0 - MIN_GAIN:
             mirrored = max(
@@ -96,7 +102,7 @@ def _compare(
 ) -> FineStructure:
     """Compare an image with the surface under the light that fits it best."""
     good = good if inside is None else good & inside
-    nothing = FineStructure(image, image, np.zeros(image.shape), 0.0)
+    nothing = FineStructure(image, image, np.zeros(image.shape), 0.0, 0.0)
     if np.count_nonzero(good) < MIN_SAMPLES:
         return nothing
     predicted, mirrors = _relight(image, good, scaled_normals)
@@ -110,7 +116,9 @@ def _compare(
     weights = (lit & (np.abs(residual) < MAX_RESIDUAL * spread)).astype(np.float64)
     own, other = _fine(image, weights), _fine(predicted, weights)
     size = float(np.sqrt(np.sum(own**2) * np.sum(other**2)))
-    return FineStructure(own, other, weights, float(np.sum(own * other)) / max(size, 1e-30))
+    correlation = float(np.sum(own * other)) / max(size, 1e-30)
+    misfit = spread / max(float(np.median(image[lit])), 1e-12)
+    return FineStructure(own, other, weights, correlation, misfit)
 
 
 def _relight(
@@ -119,17 +127,18 @@ def _relight(
     """Return the shading under the light that fits an image, and where it may have highlights."""
     lit = good & (image > MIN_SHADING * np.quantile(image[good], 0.95))
     values, rows = image[lit], scaled_normals[lit]
-    weights, light = np.ones(len(values)), np.zeros(3)
+    weights: Float64Array = np.ones(len(values))
+    light: Float64Array = np.zeros(3)
     for _ in range(N_FIT_STEPS):
         scaled = rows * weights[:, None]
         light = np.linalg.solve(rows.T @ scaled + 1e-9 * np.eye(3), scaled.T @ values)
         residual = values - rows @ light
         spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
         weights = np.maximum(1.0 - (residual / (TUKEY_CONSTANT * spread)) ** 2, 0.0) ** 2
-    half = light / max(float(np.linalg.norm(light)), 1e-12) + np.array([0.0, 0.0, 1.0])
-    half = np.asarray(half / max(float(np.linalg.norm(half)), 1e-12), np.float64)
+    towards = light / max(float(np.linalg.norm(light)), 1e-12) + np.array([0.0, 0.0, 1.0])
+    length = max(float(np.linalg.norm(towards)), 1e-12)
     albedo = np.linalg.norm(scaled_normals, axis=-1)
-    mirrors = scaled_normals @ half > MAX_MIRROR_COSINE * albedo
+    mirrors = scaled_normals @ towards > MAX_MIRROR_COSINE * albedo * length
     return np.asarray(np.maximum(scaled_normals @ light, 0.0)), np.asarray(mirrors)
 
 
