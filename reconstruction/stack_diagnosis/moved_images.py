@@ -131,7 +131,8 @@ def _relight(
     light: Float64Array = np.zeros(3)
     for _ in range(N_FIT_STEPS):
         scaled = rows * weights[:, None]
-        light = np.linalg.solve(rows.T @ scaled + 1e-9 * np.eye(3), scaled.T @ values)
+        normal = rows.T @ scaled + 1e-9 * np.eye(3)
+        light = np.asarray(np.linalg.solve(normal, scaled.T @ values), np.float64)
         residual = values - rows @ light
         spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
         weights = np.maximum(1.0 - (residual / (TUKEY_CONSTANT * spread)) ** 2, 0.0) ** 2
