@@ -9,6 +9,7 @@ A set is judged once: finished sets are lines of the file OUT, and a later run g
 sets of the run's own list count: fault, severity, rig, tone, seed and side are compared.
 
 Usage: python tools/judge_diagnosis.py [--seeds N] [--first SEED] [--side PX] [--out FILE]
+       [--faults NAME ...]
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from fixtures.faulty_stacks import GRADED, RIGS, TONES, make  # type: ignore[imp
 from reconstruction.stack_diagnosis import diagnose_stack
 
 TABLE = Path(__file__).with_name("pain_suite.csv")
-FIRST_SEED = 40_000
-"""Rules were set on seeds 300 to 312, 20146 to 20151 and 30000 to 30023."""
+FIRST_SEED = 60_000
+"""Rules were set on seeds 300 to 312, 20146 to 20151, 30000 to 30023 and 50000 to 50503."""
 KEYS = ("fault", "severity", "rig", "tone", "seed", "side")
 N_SOUND = 20
 """Sound sets per rig, tone and seed."""
@@ -134,11 +135,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="sets per row, rig and tone")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first seed")
     parser.add_argument("--side", type=int, default=64, help="pixels")
+    parser.add_argument("--faults", nargs="+", help="only these; sound: sets without a fault")
     parser.add_argument("--out", type=Path, help="file of the finished sets")
     given = parser.parse_args()
     finished = read_finished(given.out)
     judged = []
     for one in list_sets(given.seeds, given.first, given.side):
+        if given.faults and (one["fault"] or "sound") not in given.faults:
+            continue
         known = finished.get(tuple(one.values()))
         judged.append(known or judge(one))
         if given.out and known is None:

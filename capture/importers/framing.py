@@ -9,7 +9,8 @@ from capture import raw
 from capture.arrays import UInt16Array
 from capture.documents import Fault
 from capture.importers.face_finding import find_face, frame_face
-from capture.importers.images import Photo, PhotoError
+from capture.importers.image_checks import PhotoError
+from capture.importers.images import Photo
 
 MIN_SIDE_PX = 16
 """Least side of a cropped or reduced photograph, pixels."""

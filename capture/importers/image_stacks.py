@@ -13,7 +13,8 @@ from capture import raw
 from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
-from capture.importers.images import Photo, PhotoError, read_photo
+from capture.importers.image_checks import PhotoError
+from capture.importers.images import Photo, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
@@ -167,6 +168,14 @@ def import_light_list(
     return ImageStackImport(str(target), len(steps), listed, shown, masked, every)
 
 
+def _list_properties(photo: Photo) -> tuple[str, ...]:
+    """Return what all images of a stack have in common: they are not turned differently."""
+    height, width = _pixel_shape(photo.frame)
+    turned = () if photo.orientation == 1 else (f"EXIF orientation {photo.orientation}",)
+    size = f"{width} x {height}"
+    return (photo.encoding, size, photo.frame.pattern, *turned, str(photo.frame.white))
+
+
 def _pixel_shape(frame: raw.RawFrame) -> tuple[int, int]:
     """Return rows and columns of an imported image: a 2 x 2 cell is one pixel, unless MONO."""
     height, width = frame.cfa.shape
@@ -200,11 +209,8 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             inside = np.ones(shape, bool) if mask is None else light_lists.read_mask(mask, shape)
             places = np.flatnonzero(inside)
             chosen = places[:: max(1, places.size // N_SAMPLE_POINTS)]
-        same = (first.encoding, first.frame.pattern, first.frame.cfa.shape, first.frame.white)
-        if (photo.encoding, frame.pattern, frame.cfa.shape, frame.white) != same:
-            got = f"{photo.encoding} {shape[1]} x {shape[0]} {frame.pattern}"
-            wanted = _pixel_shape(first.frame)
-            expected = f"{first.encoding} {wanted[1]} x {wanted[0]} {first.frame.pattern}"
+        if _list_properties(photo) != _list_properties(first):
+            got, expected = (" ".join(_list_properties(one)[:-1]) for one in (photo, first))
             faults.append(Fault(file.name, got, expected))
             continue
         whites.append(photo.white_value)
@@ -216,7 +222,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             "images differ",
             where=str(found.images[0].parent),
             faults=faults,
-            advice="Use images of one camera and one setting.",
+            advice="Use images of one camera and one setting, turned alike.",
             code="SR-IMP-010",
         )
     samples = np.array(rows)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.documents import Fault
-from capture.importers.images import PhotoError
+from capture.importers.image_checks import PhotoError
 from capture.plan import Plan
 from capture.raw import RawFrame
 from capture.rig import Light, Rig, Vector, View

@@ -4,6 +4,8 @@ Directions are towards the lights: x right, y up, z towards the camera, as .lp f
 """
 
 import re
+import unicodedata
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +15,15 @@ import numpy as np
 
 from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.documents import Fault
+from capture.importers.image_checks import advise_conversion
 from capture.importers.images import read_photo
 from capture.importers.light_tables import (
     LightListError,
     UnequalCountError,
+    is_number,
     parse_vector,
     read_light_table,
+    read_rows,
     read_text,
 )
 from capture.raw import RawFrame
@@ -31,7 +36,7 @@ IMAGE_SUFFIXES = frozenset(
 BALL_FOLDER_NAMES = ("chrome", "ball", "sphere", "mirror")
 LIST_NAMES = tuple(
     f"{stem}.{suffix}"
-    for suffix in ("txt", "json", "npy")
+    for suffix in ("txt", "csv", "json", "npy")
     for stem in (
         *("light_directions", "lights", "light_positions"),
         *("light_dirs", "light_dir", "light_pos", "directions"),
@@ -155,9 +160,15 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     if listed.is_file():
         names = [line.strip() for line in read_text(listed).splitlines() if line.strip()]
         return tuple(_find_image_file(name, directory, listed) for name in names)
-    files = (f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
-    images = (f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f))
+    images = (
+        f for f in _list_files(directory) if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f)
+    )
     return tuple(sorted(images, key=lambda file: natural_sort_key(file.name)))
+
+
+def _list_files(directory: Path) -> list[Path]:
+    """Return the files of a folder; hidden ones are what file managers leave."""
+    return sorted(f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
 
 
 def _is_mask(file: Path) -> bool:
@@ -173,7 +184,8 @@ def _is_mask(file: Path) -> bool:
 
 def find_mask(directory: Path) -> Path | None:
     """Return the mask of a folder of images, None when it has none or several."""
-    found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and _is_mask(f)]
+    images = (f for f in _list_files(directory) if f.suffix.lower() in IMAGE_SUFFIXES)
+    found = [file for file in images if _is_mask(file)]
     return found[0] if len(found) == 1 else None
 
 
@@ -215,12 +227,15 @@ def _folder(directory: Path) -> Path:
         if folder.is_dir() and not _is_ball(folder) and _images_in(folder)
     ]
     if len(below) != 1:
+        others = Counter(file.suffix or file.name for file in _list_files(directory))
+        files = ", ".join(f"{count} {suffix}" for suffix, count in others.most_common(5))
         got = ", ".join(folder.name for folder in below) or "no images"
+        advice = [text for suffix in others if (text := advise_conversion(f"a{suffix}"))]
         raise LightListError(
             "is not a folder of one object under many lights",
             where=str(directory),
-            faults=[Fault("folders with images", got, "one")],
-            advice="Name the folder that contains the object's images.",
+            faults=[Fault("folders with images", f"{got} ({files})" if files else got, "one")],
+            advice=advice[0] if advice else "Name the folder that contains the object's images.",
         )
     return below[0]
 
@@ -231,18 +246,19 @@ def _is_ball(folder: Path) -> bool:
 
 def _source(directory: Path) -> Path:
     for folder in (directory, directory.parent):
-        lists = sorted(folder.glob("*.lp")) + sorted(folder.glob("*.LP"))
-        if len(set(lists)) > 1:
+        files = {file.name.casefold(): file for file in _list_files(folder)}
+        lists = [file for name, file in files.items() if name.endswith(".lp")]
+        if len(lists) > 1:
             raise LightListError(
                 "has several light lists",
                 where=str(folder),
                 faults=[Fault("*.lp", ", ".join(f.name for f in lists), "one")],
                 advice="Name one with --lights.",
             )
-        named = (folder / name for name in LIST_NAMES)
-        for candidate in (*lists, *named):
-            if candidate.is_file():
-                return candidate
+        named = (files[name] for name in LIST_NAMES if name in files)
+        found = next((*lists, *named).__iter__(), None)
+        if found is not None:
+            return found
     for folder in (directory, directory.parent):
         for ball in sorted(f for f in folder.iterdir() if f.is_dir() and _is_ball(f)):
             if ball != directory and _images_in(ball):
@@ -258,36 +274,40 @@ def _source(directory: Path) -> Path:
 
 def _from_lp(path: Path, directory: Path) -> LightList:
     """Read an .lp file: a count, then a file name and x y z in each line."""
-    lines = [line.strip() for line in read_text(path).splitlines() if line.strip()]
-    count = int(lines[0]) if lines and re.fullmatch(r"\d+", lines[0]) else None
-    rows = lines[1:] if count is not None else lines
-    if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
-        expected = "one line per image" if count is None else f"{count}, as in its first line"
-        raise LightListError.at(
-            "is not a complete light list", "lines", str(len(rows)), expected, where=path
-        )
     pictures, vectors = [], []
-    for number, row in enumerate(rows, start=1 if count is None else 2):
-        words = row.split()
-        where = f"{path}, line {number}"
-        vectors.append(parse_vector(words[-3:], where))
+    for number, words in _read_counted(path):
+        vectors.append(parse_vector(words[-3:], f"{path}, line {number}"))
         pictures.append(_find_image_file(" ".join(words[:-3]), directory, path))
     if len(set(pictures)) < len(pictures):
         raise LightListError("contains an image twice", where=str(path))
     return LightList(tuple(pictures), np.array(vectors), "lp", path.name)
 
 
+def _read_counted(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of a list without its count, which must be right."""
+    rows = read_rows(path)
+    count = None
+    if rows and len(rows[0][1]) == 1 and rows[0][1][0].isdigit():
+        count, rows = int(rows[0][1][0]), rows[1:]
+    if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
+        expected = "one line per image" if count is None else f"{count}, as in its first line"
+        raise LightListError.at(
+            "is not a complete light list", "lines", str(len(rows)), expected, where=path
+        )
+    return rows
+
+
 def _find_image_file(name: str, directory: Path, source: Path) -> Path:
     """Return the file of an entry: by name, without its folder, or with another suffix."""
-    base = re.split(r"[\\/]", name)[-1]
-    files = {file.name.casefold(): file for file in directory.iterdir() if file.is_file()}
-    if base.casefold() in files:
-        return files[base.casefold()]
-    stem = base.casefold().rsplit(".", 1)[0]
+    base = _fold(re.split(r"[\\/]", name)[-1])
+    files = {_fold(file.name): file for file in _list_files(directory)}
+    if base in files:
+        return files[base]
+    stem = base.rsplit(".", 1)[0]
     alike = [
         file
         for file in files.values()
-        if file.stem.casefold() == stem and file.suffix.lower() in IMAGE_SUFFIXES
+        if _fold(file.stem) == stem and file.suffix.lower() in IMAGE_SUFFIXES
     ]
     if len(alike) == 1:
         return alike[0]
@@ -300,19 +320,17 @@ def _find_image_file(name: str, directory: Path, source: Path) -> Path:
     )
 
 
+def _fold(name: str) -> str:
+    """Return a name as file systems compare it: case and composed letters do not differ."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
 def _from_text(path: Path, directory: Path, pictures: tuple[Path, ...]) -> LightList:
-    """Read rows x y z, with or without a count, for these images."""
-    rows = [line.split() for line in read_text(path).splitlines() if line.split()]
-    count = None
-    if rows and len(rows[0]) == 1 and rows[0][0].isdigit():
-        count, rows = int(rows[0][0]), rows[1:]
-    if len(rows) > MAX_LIGHTS or (count is not None and count != len(rows)):
-        raise LightListError(
-            "is not a complete light list",
-            where=str(path),
-            faults=[Fault("lines", str(len(rows)), f"{count}, as in its first line")],
-        )
-    vectors = np.array([parse_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
+    """Read rows x y z, with or without a count, for these images; names make them an .lp file."""
+    rows = _read_counted(path)
+    if all(len(words) > 3 and not is_number(words[0]) for _, words in rows):
+        return _from_lp(path, directory)
+    vectors = np.array([parse_vector(words, f"{path}, line {number}") for number, words in rows])
     _require_one_each(path, pictures, vectors)
     return LightList(pictures, vectors, "list", path.name, read_intensities(directory, len(rows)))
 
@@ -322,10 +340,8 @@ def read_intensities(directory: Path, count: int) -> Float64Array | None:
     strengths = directory / "light_intensities.txt"
     if not strengths.is_file():
         return None
-    lines = [line.split() for line in read_text(strengths).splitlines() if line.split()]
-    intensity = np.array(
-        [parse_vector(row, f"{strengths}, light {k + 1}") for k, row in enumerate(lines)]
-    )
+    lines = read_rows(strengths)
+    intensity = np.array([parse_vector(row, f"{strengths}, line {k}") for k, row in lines])
     if intensity.shape != (count, 3) or (intensity <= 0).any():
         raise LightListError(
             "does not fit the lights",
@@ -337,11 +353,16 @@ def read_intensities(directory: Path, count: int) -> Float64Array | None:
 
 def _require_one_each(path: Path, pictures: tuple[Path, ...], vectors: Float64Array) -> None:
     if len(pictures) != len(vectors):
+        stems = Counter(picture.stem for picture in pictures)
+        twice = [f.name for f in pictures if stems[f.stem] > 1][:2]
+        advice = "Move images that do not belong to the series away, or name the mask *mask*."
+        if twice:
+            advice = f"{' and '.join(twice)} look like one shot: keep one format. {advice}"
         raise UnequalCountError(
             "does not fit the images",
             where=str(path),
             faults=[Fault("lights", str(len(vectors)), f"{len(pictures)}, one per image")],
-            advice="Move images that do not belong to the series away, or name the mask *mask*.",
+            advice=advice,
             code="SR-IMP-007",
         )
 

@@ -1,7 +1,9 @@
 """Read vectors of lights from text, JSON and NumPy files."""
 
+import codecs
 import io
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,9 @@ from capture.documents import Fault, InputError, read_json
 MAX_BYTES = 2**24
 VECTOR_KEYS = ("direction", "dir", "light_dir", "position", "pos", "light_pos", "xyz", "vector")
 NAME_KEYS = ("image", "file", "filename", "file_path", "name", "frame")
+AXIS_NAMES = ("x", "y", "z")
+"""Ends of the names of columns."""
+COMMENT_MARKS = ("#", "%", "//")
 LIST_KEYS = ("lights", "frames", "images", "light_directions", "light_positions", "directions")
 
 
@@ -36,23 +41,88 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Return a text file without its byte order mark."""
+    """Return a text file without its byte order mark: UTF-8, UTF-16 or Windows-1252."""
     data = read_bytes(path)
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
     if b"\0" in data:
         raise LightListError("is not a light list", where=str(path))
-    return data.decode("utf-8-sig", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
+
+
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of a text file, with their lines from 1; comments and a header are none."""
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    rows = [
+        (number, split_row(line))
+        for number, line in lines
+        if line.strip() and not line.lstrip().startswith(COMMENT_MARKS)
+    ]
+    heads = [word.strip().casefold() for word in rows[0][1][-3:]] if rows else []
+    if len(heads) == 3 and all(map(str.endswith, heads, AXIS_NAMES)):
+        return rows[1:]
+    return rows
+
+
+def split_row(line: str) -> list[str]:
+    """Return the words of a row: semicolons, commas or spaces separate them.
+
+    The last three are a vector; all in front of them is one name.
+
+    Examples
+    --------
+    >>> split_row("img 1.png;0,5;0;1"), split_row("0.5,0,1"), split_row("a b.png 0,5 0 1")
+    (['img 1.png', '0,5', '0', '1'], ['0.5', '0', '1'], ['a b.png', '0,5', '0', '1'])
+    """
+    if ";" in line:
+        words = line.split(";")
+    elif re.search(r",\s", line) or line.split()[-1].count(",") > 1:
+        words = line.split(",")
+    else:
+        words = line.rsplit(maxsplit=3)
+    return [word.strip().strip('"') for word in words if word.strip()]
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number, with a decimal point or comma.
+
+    Examples
+    --------
+    >>> is_number("-0,5"), is_number("1e-3"), is_number("img1")
+    (True, True, False)
+    """
+    try:
+        float(word.replace(",", ".") if "." not in word else word)
+    except ValueError:
+        return False
+    return True
 
 
 def parse_vector(words: Sequence[str], where: str) -> list[float]:
     """Return three finite numbers, not all zero; a decimal comma is accepted."""
-    try:
-        vector = [float(word.replace(",", ".") if "." not in word else word) for word in words]
-    except ValueError:
-        vector = []
-    if len(vector) != 3 or not all(map(math.isfinite, vector)) or not any(vector):
+    vector = [
+        float(word.replace(",", ".") if "." not in word else word)
+        for word in words
+        if is_number(word)
+    ]
+    if (
+        len(vector) != 3
+        or len(words) != 3
+        or not all(map(math.isfinite, vector))
+        or not any(vector)
+    ):
         got = " ".join(words)[:60] or "nothing"
+        angles = " For angles write x = cos(elevation) cos(azimuth), y = cos(elevation) "
+        angles += "sin(azimuth), z = sin(elevation)."
         raise LightListError(
-            "is not a light list", where=where, faults=[Fault("light", got, "three numbers x y z")]
+            "is not a light list",
+            where=where,
+            faults=[Fault("light", got, "three numbers x y z, not all zero")],
+            advice="Give the direction towards the light: x right, y up, z towards the camera."
+            + (angles if len(vector) == 2 else ""),
         )
     return vector
 
@@ -86,6 +156,7 @@ def read_light_table(path: Path) -> tuple[list[str], Float64Array]:
         except (ValueError, EOFError, MemoryError, OverflowError) as exc:
             raise LightListError("is not a NumPy array", where=str(path)) from exc
     else:
+        data = data.removeprefix(codecs.BOM_UTF8)
         rows = read_json(data, where=str(path), error=LightListError)
     for key in LIST_KEYS:
         if isinstance(rows, Mapping) and isinstance(rows.get(key), list | dict):

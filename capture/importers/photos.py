@@ -11,7 +11,8 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.framing import Framing
-from capture.importers.images import Encoding, Photo, PhotoError, read_photo
+from capture.importers.image_checks import VIDEO_SUFFIXES, PhotoError, advise_conversion
+from capture.importers.images import Encoding, Photo, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
@@ -32,8 +33,9 @@ IMPORTED_RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
 RAW_CURVES = "Nikon 5100 (NPL)"  # assumed for a camera without a measured sensitivity
 IMAGE_CURVES = "linear sRGB"
-SIDECAR_SUFFIXES = frozenset(
-    ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
+SIDECAR_SUFFIXES = VIDEO_SUFFIXES | frozenset(
+    ".txt .md .csv .json .npy .lp .xmp .aae .thm .pp3 .dop .xml .html .pdf .doc .docx .xlsx .zip"
+    " .db .ini".split()
 )
 UNEQUAL_PAIR_NOTE = "differ in color or size, so that no specular image follows from them"
 """End of an assumption that begins with the names of two files."""
@@ -191,10 +193,15 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
             "contains no photographs",
             where=str(directory),
             faults=[Fault("files", f"{len(ignored)} other entries", "at least one photograph")],
-            advice="Name a folder with photographs.",
+            advice=_advise(ignored) or "Name a folder with photographs.",
             code="SR-IMP-012",
         )
     return files, ignored
+
+
+def _advise(names: Sequence[str]) -> str:
+    """Return how the first file of another format is converted; empty where there is none."""
+    return next((text for name in names if (text := advise_conversion(name))), "")
 
 
 def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
@@ -222,7 +229,12 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
             f"{len(faults)} of {len(files)} files cannot be imported",
             where=str(files[0].parent),
             faults=faults,
-            advice="Repair these files or move them away; nothing was written.",
+            advice=" ".join(
+                [
+                    "Repair these files or move them away; nothing was written.",
+                    _advise([fault.path for fault in faults]),
+                ]
+            ).strip(),
             code="SR-IMP-013",
         )
     white_value = find_common_white([entry.white_value for entry in entries])

@@ -16,6 +16,7 @@ from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.stack_diagnosis import axis_faults, frame_faults, light_faults
 from reconstruction.stack_diagnosis.finding import Finding
 from reconstruction.stack_diagnosis.light_labels import find_order
+from reconstruction.stack_diagnosis.moved_images import find_moved
 from reconstruction.stack_diagnosis.reduced_stack import ReducedStack, reduce_stack
 from reconstruction.stack_diagnosis.shading_space import (
     MAX_POINTS,
@@ -191,7 +192,7 @@ def _diagnose_light(
     used = np.flatnonzero(~out)
     view = replace(stack, gray=stack.gray / strength[:, None, None])
     once = np.array([number for number in kept if number not in repeated], np.intp)
-    of_images = _find_in_images(view, rows, directions, used, once, rng)
+    of_images = _find_in_images(view, rows, used, once, rng)
     ambient = any(one.fault == AMBIENT for one in of_images)  # it changes strengths with tilt
     findings += [one for one in lights if not (ambient and one.fault == DRIFT)]
     moved = {number for one in of_images if one.fault in MOVED_FAULTS for number in one.frames}
@@ -204,7 +205,6 @@ def _diagnose_light(
 def _find_in_images(
     stack: ReducedStack,
     rows: Float64Array,
-    directions: Float64Array,
     used: NDArray[np.intp],
     kept: NDArray[np.intp],
     rng: np.random.Generator,
@@ -217,8 +217,6 @@ def _find_in_images(
         Images over the strength of their light.
     rows
         (N, 3), listed directions in the order of the images.
-    directions
-        (N, 3), as the images show them.
     used, kept
         Images for the normals, and images that may have moved.
     """
@@ -235,10 +233,8 @@ def _find_in_images(
             stack.gray[used], stack.usable[used], valid, predicted
         )
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
-    relit = np.maximum(np.einsum("hwi,ni->nhw", normals, directions[kept]), 0.0)
-    moved = frame_faults.find_moved(
-        stack.gray[kept], stack.usable[kept], valid, albedo * shading[kept], albedo * relit
-    )
+    scaled = albedo[..., None] * normals
+    moved = find_moved(stack.gray[kept], stack.usable[kept], valid, scaled)
     findings += [_renumbered(one, kept) for one in moved]
     height, width = mask.shape
     places = np.argwhere(valid)
@@ -246,12 +242,12 @@ def _find_in_images(
     half = max(0.5 * np.sqrt(np.count_nonzero(mask)), 1.0)
     xy = np.stack([places[:, 1] - (width - 1) / 2, (height - 1) / 2 - places[:, 0]], axis=1) / half
     at = (slice(None), places[:, 0], places[:, 1])
-    scaled = stack.gray[used][at] / np.maximum(albedo[at[1:]], 1e-9)
+    over_albedo = stack.gray[used][at] / np.maximum(albedo[at[1:]], 1e-9)
     matte = shading[used][at]
     mirror_cosine = unit_vectors(rows[used] + (0.0, 0.0, 1.0)) @ normals[at[1:]].T
-    lit = (matte > MIN_MATTE) & (np.abs(scaled - matte) < MAX_MATTE_ERROR)
+    lit = (matte > MIN_MATTE) & (np.abs(over_albedo - matte) < MAX_MATTE_ERROR)
     weights = lit.astype(np.float64)
-    findings += light_faults.find_near(scaled, weights, mirror_cosine, rows[used], xy)
+    findings += light_faults.find_near(over_albedo, weights, mirror_cosine, rows[used], xy)
     return findings
 
 

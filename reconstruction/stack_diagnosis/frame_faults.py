@@ -1,4 +1,4 @@
-"""Find images that are empty, padded, repeated, clipped, moved or mirrored."""
+"""Find images that are empty, padded, repeated, clipped or full-bright."""
 
 from __future__ import annotations
 
@@ -22,16 +22,6 @@ MAX_REPEAT_DIFFERENCE = 0.25
 """Difference of two images over the typical difference of an image to its most similar one."""
 MIN_REPEAT_ANGLE_DEG = 2.0
 """Angle between listed lights up to which images may be equal."""
-MIN_SHIFT_PX = 0.7
-MIN_SHIFT_SIGMAS = 6.0
-MIN_IMAGE_CORRELATION = 0.5
-MAX_SHIFT_FRACTION = 0.25
-"""Of the smaller side of an image."""
-MAX_REST_AFTER_SHIFT = 0.6
-"""Remaining difference over the difference without a shift."""
-N_SHIFT_STEPS = 8
-N_TRIMMED = 3
-"""Standard deviations beyond which residuals do not enter a shift."""
 
 
 def find_unlit(gray: Float64Array, inside: BoolArray) -> Iterator[Finding]:
@@ -154,113 +144,3 @@ def find_repeated(samples: Float64Array, directions: Float64Array) -> Iterator[F
             float(1.0 - apart[i, j] / typical), 1.0 - MAX_REPEAT_DIFFERENCE,
             "one of the two is a copy: find the missing image",
         )  # fmt: skip
-
-
-def find_moved(
-    gray: Float64Array,
-    usable: BoolArray,
-    inside: BoolArray,
-    predicted: Float64Array,
-    relit: Float64Array,
-) -> Iterator[Finding]:
-    """Yield images that are mirrored, or shifted against what the other images predict.
-
-    Parameters
-    ----------
-    gray, usable
-        (N, H, W), samples and whether they are usable.
-    inside
-        (H, W), the object.
-    predicted
-        (N, H, W), the matte shading of each light by normals and albedo of all images.
-    relit
-        The same for the directions that the images show: an image that it explains has a wrong
-        light, and has not moved.
-    """
-    for number, (image, shading, other) in enumerate(zip(gray, predicted, relit, strict=True)):
-        good = inside & usable[number] & (shading > 0.0)
-        if np.count_nonzero(good) < 100:
-            continue
-        mirrored = max(
-            _correlation(image[:, ::-1], shading, good), _correlation(image[::-1], shading, good)
-        )
-        straight = max(_correlation(image, one, good) for one in (shading, other))
-        if mirrored > straight + 0.1 and mirrored > MIN_IMAGE_CORRELATION:
-            yield Finding(
-                "mirrored image", (number,),
-                f"image {number + 1} mirrored correlates with the others by {mirrored:.2f}, as it "
-                f"is by {straight:.2f}",
-                mirrored - straight, 0.1, "mirror the image back",
-            )  # fmt: skip
-            continue
-        shift, sigma = _shift_px(image, shading, other, good)
-        size = float(np.hypot(*shift))
-        if size > max(MIN_SHIFT_PX, MIN_SHIFT_SIGMAS * sigma):
-            yield Finding(
-                "moved image", (number,),
-                f"image {number + 1} is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) pixels, "
-                f"standard error {sigma:.2f}",
-                size, max(MIN_SHIFT_PX, MIN_SHIFT_SIGMAS * sigma),
-                "align the image with the others, or leave it out",
-            )  # fmt: skip
-
-
-def _correlation(image: Float64Array, shading: Float64Array, good: BoolArray) -> float:
-    return float(np.corrcoef(image[good], shading[good])[0, 1])
-
-
-def _shift_px(
-    image: Float64Array, shading: Float64Array, other: Float64Array, good: BoolArray
-) -> tuple[Float64Array, float]:
-    """Return the shift (x, y) of an image against its shading, px, and its standard error.
-
-    The search starts without a shift, and at the phase correlation of both gradients. A shift that
-    does not explain the difference of the two is none; nor is one where another light explains it.
-    """
-    import cv2
-
-    edges = [np.hypot(*np.gradient(np.where(good, one, 0.0))) for one in (image, shading)]
-    window = cv2.createHanningWindow(image.shape[::-1], cv2.CV_64F)
-    coarse = np.array(cv2.phaseCorrelate(edges[1], edges[0], window)[0], np.float64)
-    starts = [np.zeros(2)]
-    if 1.0 < np.abs(coarse).max() < MAX_SHIFT_FRACTION * min(image.shape):
-        starts.append(coarse)
-    tries = [_refine_shift(image, shading, good, start) for start in starts]
-    shift, sigma, rest = min(tries, key=lambda one: one[2])
-    before = min(_difference(image, one, good)[1] for one in (shading, other))
-    return (shift, sigma) if rest < MAX_REST_AFTER_SHIFT * before else (np.zeros(2), sigma)
-
-
-def _difference(
-    image: Float64Array, shading: Float64Array, good: BoolArray
-) -> tuple[Float64Array, float]:
-    """Return image minus shading at one gain, and its robust standard deviation."""
-    lit = good & (shading > np.quantile(shading[good], 0.3))
-    gain = float(np.median(image[lit] / np.maximum(shading[lit], 1e-9)))
-    difference = image / max(gain, 1e-9) - shading
-    return difference, 1.4826 * float(np.median(np.abs(difference[good]))) + 1e-12
-
-
-def _refine_shift(
-    image: Float64Array, shading: Float64Array, good: BoolArray, shift: Float64Array
-) -> tuple[Float64Array, float, float]:
-    """Return shift, standard error and remaining difference after Gauss-Newton steps."""
-    import cv2
-
-    down, across = (np.asarray(one, np.float64) for one in np.gradient(shading))
-    size = image.shape[::-1]
-    sigma = rest = np.inf
-    for step in range(N_SHIFT_STEPS):
-        back = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        moved = cv2.warpAffine(image, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        difference, rest = _difference(moved, shading, good)
-        if step == N_SHIFT_STEPS - 1:
-            break
-        kept = good & (np.abs(difference) < N_TRIMMED * rest)
-        rows = -np.stack([across[kept], down[kept]], axis=1)
-        normal = rows.T @ rows + 1e-12 * np.eye(2)
-        by = np.linalg.solve(normal, rows.T @ difference[kept])
-        shift = np.asarray(shift + np.clip(by, -3.0, 3.0), np.float64)
-        sigma = float(rest * np.sqrt(np.linalg.inv(normal).trace()))
-    return shift, sigma, float(rest)

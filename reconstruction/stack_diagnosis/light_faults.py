@@ -23,14 +23,14 @@ SHADOW_COSINE = -0.15
 """Shading below which a point is turned away from a light."""
 MIRROR_COSINES = (0.85, 0.65)
 """Samples with larger cosines may hold a highlight; the second limit leaves out wide lobes too."""
-MIN_KEPT_FRACTION = 0.9
+MIN_KEPT_FRACTION = 0.5
 """Of the coefficient, which highlights lose between the two limits and near lights do not."""
 MIN_NEAR_LIGHTS, MIN_NEAR_POINTS = 6, 50
 MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
 """Twice half a width of the object over the distance of the lights, and its certainty."""
 STRENGTH_RANGE = (0.75, 1.35)
 MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
-MIN_FLICKER = 0.025
+MIN_FLICKER = 0.04
 """Spread of the light from line to line, relative, beyond that across the lines."""
 MIN_LIT = 0.5
 """Light over matte shading; cast shadows have less."""

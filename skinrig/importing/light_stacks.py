@@ -10,6 +10,7 @@ import numpy as np
 
 from capture.documents import Fault, InputError
 from capture.importers.camera_poses import read_camera_axes
+from capture.importers.image_checks import VIDEO_SUFFIXES, advise_conversion
 from capture.importers.image_stacks import LINEAR_MISFIT_RATIO, Encoding, encode_srgb
 from capture.importers.images import read_photo
 from capture.importers.imported_session import find_common_white
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 ESTIMATE_LIGHTS: Final = "estimate"
 """Value of ``--lights`` under which the images themselves show their lights."""
-VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
 CAMERA_FOLDER = re.compile(r"(?i)(cam|view|c)[a-z]*[_-]?\d+$")
 MIN_SIGN_EVIDENCE = 0.1
 MIN_OBJECT_PX = 20
@@ -125,9 +125,7 @@ def _require_images(directory: Path) -> None:
     """Refuse a video, and folders of several cameras, with what to do."""
     if directory.is_file() and directory.suffix.lower() in VIDEO_SUFFIXES:
         raise LightListError(
-            "is a video",
-            where=str(directory),
-            advice="Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one.",
+            "is a video", where=str(directory), advice=advise_conversion(directory.name)
         )
     if directory.is_dir():
         try:

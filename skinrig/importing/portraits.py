@@ -49,7 +49,7 @@ def analyze_portrait(
     ------
     skinrig.errors.UnusableError
         If `photograph` is not a file, or gray, or `out` has content.
-    capture.importers.images.PhotoError
+    capture.importers.image_checks.PhotoError
         If it cannot be read, or shows no face.
     """
     from capture.importers import import_photos

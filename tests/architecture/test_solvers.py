@@ -32,7 +32,7 @@ NEED_NO_REPORT = {
     "reconstruction/gradient_normals/moment_kernels.py": "two rounds of noise, not a search",
     "reconstruction/photometric_stereo/kernels.py": "a pixel's residual is in its error",
     "reconstruction/registration/strain.py": "a fixed number of rounds of tracking",
-    "reconstruction/stack_diagnosis/frame_faults.py": "a fixed number of steps, with its residual",
+    "reconstruction/stack_diagnosis/moved_images.py": "a fixed number of steps, with its residual",
     "reconstruction/subsurface/levenberg_marquardt.py": "returns each fit's state by its number",
     "reconstruction/tsumura.py": "scikit-learn warns",
     "rigsim/as_built/dome.py": "the simulator's lens has an inverse",

@@ -12,6 +12,7 @@ from reconstruction.stack_diagnosis import (
     frame_faults,
     light_faults,
     light_labels,
+    moved_images,
     reduced_stack,
     shading_space,
     special_images,
@@ -86,8 +87,9 @@ def test_checks_of_sound_images_find_nothing(seed, lights):
     assert not list(frame_faults.find_clipped(np.zeros(lights)))
     assert not list(frame_faults.find_full_bright(samples))
     assert not list(frame_faults.find_repeated(samples, directions))
-    assert not list(frame_faults.find_moved(images, usable, inside, images, images))
     albedo = np.full(inside.shape, 0.8)
+    scaled = albedo[..., None] * normals * inside[..., None]
+    assert not list(moved_images.find_moved(images, usable, inside, scaled))
     assert not list(light_faults.find_ambient(images, inside, normals, albedo, directions))
     assert not list(light_faults.find_strengths(strength, np.ones(lights, bool)))
     lit = np.asarray(shading[:, inside] > 0.25, float)

@@ -7,7 +7,7 @@ import skimage.data
 
 from capture.importers.face_finding import find_face, frame_face
 from capture.importers.framing import Framing
-from capture.importers.images import PhotoError
+from capture.importers.image_checks import PhotoError
 from capture.importers.photos import import_photos
 from capture.session import Session
 

@@ -1,0 +1,222 @@
+"""Check that a file is a whole image before it is decoded, and name what else it is."""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from capture.documents import Fault, InputError
+
+MAX_IMAGE_BYTES = 2**30
+MAX_IMAGE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
+MAX_IMAGE_SIDE_PX = 32_767
+_IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
+
+
+VIDEO_ADVICE = "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
+CONVERSION_ADVICE = "Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW."
+VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
+VIDEO_BRANDS = (b"isom", b"mp42", b"qt  ", b"avc1", b"M4V ")
+OTHER_KINDS = {
+    "HEIC image": ((b"heic", b"heix", b"mif1", b"msf1"), (".heic", ".heif")),
+    "AVIF image": ((b"avif",), (".avif",)),
+    "WebP image": ((b"RIFF",), (".webp",)),
+    "GIF image": ((b"GIF8",), (".gif",)),
+    "BMP image": ((b"BM",), (".bmp",)),
+    "Photoshop file": ((b"8BPS",), (".psd", ".psb")),
+    "JPEG XL image": ((b"\xff\x0a",), (".jxl",)),
+    "JPEG 2000 image": ((b"\0\0\0\x0cjP",), (".jp2", ".j2k")),
+}
+"""Formats that are not read: first bytes, or the brand of ISO base media, and suffixes."""
+OTHER_IMAGE_SUFFIXES = frozenset(one for _, suffixes in OTHER_KINDS.values() for one in suffixes)
+
+
+class PhotoError(InputError):
+    """Raised for a photograph, or a folder of them, that cannot be imported."""
+
+
+def image_error(what: str, where: str, path: str, got: str, expected: str) -> PhotoError:
+    """Return the error of one fault of a file."""
+    return photo_error(what, where, [Fault(path, got, expected)])
+
+
+def photo_error(what: str, where: str, faults: Sequence[Fault]) -> PhotoError:
+    """Return the error of a file, with what to do."""
+    return PhotoError(what, where=where, faults=faults, advice=_IMAGE_ADVICE, code="SR-IMP-014")
+
+
+def read_head(file: Path, where: str) -> bytes:
+    """Return the first 16 bytes of a file; refuse what is empty, too large or not a file."""
+    try:
+        if not file.is_file():
+            raise image_error("is not a file", where, "file", "nothing or a folder", "a photograph")
+        size = file.stat().st_size
+        if size == 0:
+            raise image_error("is empty", where, "size", "0 bytes", "a photograph")
+        if size > MAX_IMAGE_BYTES:
+            raise image_error(
+                "is too large", where, "size", f"{size} bytes", f"at most {MAX_IMAGE_BYTES}"
+            )
+        with file.open("rb") as stream:
+            return stream.read(16)
+    except OSError as exc:
+        raise image_error(
+            "cannot be read", where, "file", str(exc.strerror), "a photograph"
+        ) from exc
+
+
+def check_size(width: int, height: int, where: str) -> None:
+    """Refuse an image, width and height in pixels, that no camera takes."""
+    if (
+        min(width, height) < 1
+        or max(width, height) > MAX_IMAGE_SIDE_PX
+        or (width * height > MAX_IMAGE_PIXELS)
+    ):
+        raise image_error(
+            "is implausible in size",
+            where,
+            "size",
+            f"{width} x {height} pixels",
+            f"sides of 1 to {MAX_IMAGE_SIDE_PX}, at most {MAX_IMAGE_PIXELS} pixels",
+        )
+
+
+def check_png(data: bytes, where: str) -> list[str]:
+    """Check the chunks of a PNG, sizes, checksums and end, and return notes on its content."""
+    at = 8
+    kinds: set[bytes] = set()
+    notes: list[str] = []
+    while True:
+        if at + 12 > len(data):
+            raise image_error("is cut short", where, "PNG", f"{len(data)} bytes", "a whole file")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if at + 12 + length > len(data):
+            raise image_error("is cut short", where, "PNG", f"{len(data)} bytes", "a whole file")
+        (found,) = struct.unpack_from(">I", data, at + 8 + length)
+        if zlib.crc32(data[at + 4 : at + 8 + length]) != found:
+            name = kind.decode("ascii", "replace")
+            raise image_error(
+                "is damaged", where, f"PNG chunk {name}", "a wrong checksum", "its own"
+            )
+        if not kinds:
+            if kind != b"IHDR" or length != 13:
+                raise image_error("is damaged", where, "PNG", "no header", "a header first")
+            width, height, _, color = struct.unpack_from(">IIBB", data, at + 8)
+            check_size(width, height, where)
+            if color in (4, 6):
+                notes.append("transparency was dropped")
+        kinds.add(kind)
+        at += 12 + length
+        if kind == b"IEND":
+            break
+    if kinds & {b"iCCP", b"cICP"}:
+        notes.append("its color profile was not applied; the colors count as sRGB")
+    return notes
+
+
+_EXIF_POINTER, _COLOR_SPACE_TAG, _UNCALIBRATED = 0x8769, 0xA001, 0xFFFF
+_ORIENTATION_TAG, N_ORIENTATIONS = 0x0112, 8
+_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def check_jpeg(data: bytes, where: str) -> tuple[list[str], int]:
+    """Check the segments of a JPEG, and return notes on its content and its EXIF orientation."""
+    at, notes, sized, orientation = 2, [], False, 1
+    cut = image_error("is cut short", where, "JPEG", f"{len(data)} bytes", "a whole file")
+    while True:
+        if at + 4 > len(data):
+            raise cut
+        if data[at] != 0xFF:
+            raise image_error("is damaged", where, "JPEG", f"no marker at byte {at}", "a marker")
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker == 0x01 or 0xD0 <= marker <= 0xD8:  # markers without a length
+            at += 2
+            continue
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if length < 2 or at + 2 + length > len(data):
+            raise cut
+        body = data[at + 4 : at + 2 + length]
+        if marker in _JPEG_SIZE_MARKERS and len(body) >= 5:
+            height, width = struct.unpack_from(">HH", body, 1)
+            check_size(width, height, where)
+            sized = True
+            if body[5:6] == b"\4":
+                notes.append("its four inks (CMYK) were converted without their color profile")
+        if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0") and b"sRGB" not in body:
+            notes.append("its color profile was not applied; the colors count as sRGB")
+        if marker == 0xE1 and body.startswith(b"Exif\0\0"):
+            uncalibrated, orientation = _read_exif(body[6:])
+            if uncalibrated:
+                notes.append(
+                    "its EXIF names no sRGB (uncalibrated color); the colors count as sRGB"
+                )
+            if orientation != 1:
+                notes.append(f"the image was turned as its EXIF orientation {orientation} asks")
+        at += 2 + length
+        if marker == 0xDA:
+            break
+    # the scan escapes 0xFF, so that this can only be the end of the image
+    if not sized or data.find(b"\xff\xd9", at) < 0:
+        raise cut
+    return list(dict.fromkeys(notes)), orientation
+
+
+def _read_exif(tiff: bytes) -> tuple[bool, int]:
+    """Return whether EXIF data state a color space that is not sRGB, and the orientation.
+
+    Exif 2.32, tags 0xA001 and 0x0112.
+    """
+    from PIL.Image import Exif
+
+    found = Exif()
+    try:
+        found.load(b"Exif\0\0" + tiff)
+        orientation = found.get(_ORIENTATION_TAG, 1)
+        uncalibrated = found.get_ifd(_EXIF_POINTER).get(_COLOR_SPACE_TAG) == _UNCALIBRATED
+    except (SyntaxError, ValueError, struct.error, OSError):  # damaged: the pixels may be right
+        return False, 1
+    known = isinstance(orientation, int) and 1 <= orientation <= N_ORIENTATIONS
+    return uncalibrated, orientation if known else 1
+
+
+def require_photograph(file: Path, head: bytes) -> None:
+    """Refuse images of other formats, and videos, by their first bytes or suffix."""
+    suffix = file.suffix.lower()
+    brand = head[8:12] if head[4:8] == b"ftyp" else b""
+    kind = next(
+        (
+            name
+            for name, (brands, suffixes) in OTHER_KINDS.items()
+            if brand in brands or head.startswith(brands) or suffix in suffixes
+        ),
+        "video" if suffix in VIDEO_SUFFIXES or brand in VIDEO_BRANDS else None,
+    )
+    if kind is None:
+        return
+    raise PhotoError(
+        f"is a {kind}",
+        where=str(file),
+        advice=VIDEO_ADVICE if kind == "video" else CONVERSION_ADVICE,
+        code="SR-IMP-014",
+    )
+
+
+def advise_conversion(name: str) -> str:
+    """Return how a file of another format becomes images that are read; empty for others.
+
+    Examples
+    --------
+    >>> advise_conversion("IMG_1.HEIC")
+    'Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW.'
+    >>> advise_conversion("notes.txt")
+    ''
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        return VIDEO_ADVICE
+    if suffix in OTHER_IMAGE_SUFFIXES:
+        return CONVERSION_ADVICE
+    return ""
