@@ -29,6 +29,7 @@ from skinrig.commands import (
     planning,
     reconstructing,
     rendering,
+    sessions,
     showing,
     simulating,
 )
@@ -103,7 +104,7 @@ def demo(
 
 
 for command in (
-    capturing.verify,
+    sessions.verify,
     importing.photo,
     importing.diagnose,
     reconstructing.calibrate,
@@ -128,7 +129,7 @@ dynamic.fit_app.command("brdf", cls=Command)(editing.fit_brdf)
 app.add_typer(simulating.simulate_app, name="simulate")
 app.add_typer(capturing.capture_app, name="capture")
 app.add_typer(capturing.serve_app, name="serve")
-app.add_typer(capturing.session_app, name="session")
+app.add_typer(sessions.session_app, name="session")
 app.add_typer(planning.plan_app, name="plan")
 app.add_typer(importing.import_app, name="import")
 app.add_typer(dynamic.fit_app, name="fit")

@@ -200,7 +200,7 @@ def require_photograph(file: Path, head: bytes) -> None:
         f"is a {kind}",
         where=str(file),
         advice=VIDEO_ADVICE if kind == "video" else CONVERSION_ADVICE,
-        code="SR-IMP-014",
+        code="SR-IMP-017",
     )
 
 

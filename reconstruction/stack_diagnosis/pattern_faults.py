@@ -139,7 +139,7 @@ def _find_missing(images: Mapping[str, FloatArray], inside: BoolArray) -> Iterat
     for number, name in enumerate(series):
         if name not in images:
             yield Finding(
-                "missing pattern", (number,), f"there is no image of the pattern {name}",
+                "missing pattern", (number,), f"the pattern {name} has no image",
                 1.0, 0.5, f"take the pattern {name}, or leave all inverse patterns out",
             )  # fmt: skip
     if not inside.any():

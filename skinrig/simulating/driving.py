@@ -42,8 +42,13 @@ from skinrig.simulating.orders import (
     SimulationResult,
     truth_folder,
 )
-from skinrig.simulating.replay import ReplayedSession, ReplayedWorld, exposures_folder
-from skinrig.simulating.resumption import SessionComplete, list_refusals
+from skinrig.simulating.resumption import (
+    ReplayedSession,
+    ReplayedWorld,
+    SessionComplete,
+    exposures_folder,
+    list_refusals,
+)
 
 Log = TypeVar("Log", bound=SceneLog)
 

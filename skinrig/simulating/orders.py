@@ -15,9 +15,9 @@ from capture.session import SubjectRecord
 from rigsim.as_built.aging import RigAge, draw_rig_age
 from rigsim.mitsuba.variant import Renderer
 from skinrig.capturing.sequences import SequenceOrder
+from skinrig.capturing.source_date import read_clock
 from skinrig.errors import UsageError, require_choice
 from skinrig.simulating.effect_omission import omission_arguments
-from skinrig.source_date import read_clock
 
 PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
