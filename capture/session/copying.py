@@ -274,7 +274,7 @@ def _locked_part(
     try:
         if not disk.lock(descriptor):
             raise SessionLocked(
-                "another process is writing this copy",
+                "another process is writing this session",
                 where=str(part),
                 advice="Wait for its end.",
                 code="SR-SES-003",
@@ -312,7 +312,7 @@ def _require_free(place: Path, target: Path) -> None:
             where=str(target),
             faults=[Fault("folder", got, expected)],
             advice=advice,
-            code="SR-SES-008",
+            code="SR-SES-022",
         )
 
 
