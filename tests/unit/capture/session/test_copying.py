@@ -187,6 +187,6 @@ def test_unusable_folder_of_copy_is_refused(tmp_path, name):
     source = write_session(tmp_path / "s")
     (tmp_path / "there").mkdir()
     before = read_files(tmp_path)
-    with pytest.raises(SessionError, match="SR-SES-008"):
+    with pytest.raises(SessionError, match="SR-SES-022"):
         copy_session(source, tmp_path / name)
     assert read_files(tmp_path) == before
