@@ -91,8 +91,8 @@ def list_steps(rig: str, scale: str, seed: int) -> Iterator[Step]:
     if rig == "flash":
         fit = ["fit", "facial-color", "session-skin", *calibrated, "--out", "appearance-moving"]
         yield "fit expressions", fit
-        fit = ["fit", "facial-color", "session-sequence", *calibrated]
-        yield "fit sequence", [*fit, "--out", "appearance-sequence"]
+        curves = ["--maps", "perfusion_curves", *calibrated, "--out", "appearance-sequence"]
+        yield "reconstruct sequence", ["reconstruct", "session-sequence", *curves]
     if rig == "gradient":
         fit = ["fit", "microstructure", "appearance-skin", "--out", "appearance-moving"]
         yield "fit microstructure", fit
