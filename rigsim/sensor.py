@@ -13,6 +13,7 @@ from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 
 CFA_CHANNELS: Final = {"R": 0, "G": 1, "B": 2}
+"""Layer of each filter color in camera RGB."""
 
 
 def filter_channels(cfa: str) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -25,9 +26,6 @@ def filter_channels(cfa: str) -> tuple[tuple[int, int], tuple[int, int]]:
     """
     a, b, c, d = (CFA_CHANNELS[color] for color in cfa)
     return (a, b), (c, d)
-
-
-"""Layer of each filter color in camera RGB."""
 
 
 class SensorError(ValueError):

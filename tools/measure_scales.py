@@ -143,12 +143,14 @@ def run(rig: str, scale: str, seed: int, out: Path) -> dict[str, Any]:
             continue
         print(f"{rig}, {scale}: {name}", file=sys.stderr, flush=True)
         log = logs / f"{name.replace(' ', '-')}.txt"
-        if words[0] == "simulate" and (out / words[-1]).exists():
+        resumed = words[0] == "simulate" and (out / words[-1] / "session.json").exists()
+        if resumed:
             words.append("--resume")
         found = measure_command([sys.executable, "-m", "skinrig", *words], out, log)
         if found["exit"]:
             raise SystemExit(f"{name}: exit code {found['exit']}, see {log}")
-        found["load"] = os.getloadavg()[0]
+        # figures of a step that was interrupted are those of its last part
+        found |= {"load": os.getloadavg()[0], "resumed": resumed}
         record["steps"][name] = found
         written.write_text(json.dumps(record, indent=1), "utf-8")
     record["disk_mb"] = measure_folder_mb(out)
@@ -221,6 +223,7 @@ def tabulate(records: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         for name in group[-1]["steps"]:
             cells = [
                 f"{step['seconds']:.1f}; {step['processor_s']:.1f}; {step['peak_mb']:.0f}"
+                + (" (last part)" if step.get("resumed") else "")
                 if (step := one["steps"].get(name))
                 else "-"
                 for one in group

@@ -118,12 +118,12 @@ def _print_marker(light: BoolArray, number: int, top: int, left: int) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateImage:
-    """What a camera's pixels see of a plate, which serves all lights."""
+    """Points of a plate in a camera's pixels, for all lights."""
 
     shape: tuple[int, int]
     """Rows and columns of the image."""
     pixel: Int64Array
-    """Pixels that see print, index into the flat image, ascending, shape (n,)."""
+    """Pixels with a point of the plate, index into the flat image, ascending, shape (n,)."""
     surface: Float64Array
     """Their reflectance, place x and y in mm, and slopes x and y, on the plate, shape (n, 5)."""
 

@@ -89,8 +89,6 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         asked["plan"] = order.plan.to_json()
     if order.renderer != "mitsuba":
         asked["renderer"] = order.renderer
-    if order.iso_factor != 1.0:
-        asked["iso_factor"] = order.iso_factor
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
     return asked | rig_settings | session_settings(order)
@@ -103,6 +101,8 @@ def session_settings(order: SimulationOrder) -> dict[str, Any]:
         found["session_seed"] = order.session_seed
     if order.days_ago:
         found["days_ago"] = order.days_ago
+    if order.iso_factor != 1.0:
+        found["iso_factor"] = order.iso_factor
     return found
 
 
@@ -161,26 +161,23 @@ def open_session(
     """Create the session of an order, or resume it if its settings are the same."""
     if order.resume:
         opened = Session.open(order.out)
-        session = opened if opened.complete else ReplayedSession.resume(order.out)
-        if opened.complete:
-            shutil.rmtree(exposures_folder(order.out), ignore_errors=True)
-        lines = list_refusals(session, settings, order.seed, order.person)
-        if lines:
-            session.release()
+        # a refused session stays as it is: a measured one has frames that no replay gives again
+        if lines := list_refusals(opened, settings, order.seed, order.person):
             differing = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
                 f"{order.out}: cannot be resumed with these settings{differing}\n"
                 "  resume with the same settings, or name another folder [SR-SIM-001]"
             )
-        return session
-    order.out.parent.mkdir(parents=True, exist_ok=True)
-    if not order.out.exists():
+        if not opened.complete:
+            return ReplayedSession.resume(order.out)
         shutil.rmtree(exposures_folder(order.out), ignore_errors=True)
+        return opened
+    order.out.parent.mkdir(parents=True, exist_ok=True)
     created = order.captured_at
     subject = order.person or SubjectRecord(
         subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES
     )
-    return ReplayedSession.create(
+    session = ReplayedSession.create(
         order.out,
         plan=plan,
         rig=rig,
@@ -199,6 +196,9 @@ def open_session(
         session_id=derive_session_id(created, order.seed, settings, subject),
         now=lambda: created,
     )
+    if isinstance(session, ReplayedSession):
+        session.exposures.clear()  # of a removed session of this name
+    return session
 
 
 def derive_session_id(
@@ -215,8 +215,8 @@ def derive_session_id(
     --------
     >>> from datetime import UTC, datetime
     >>> subject = SubjectRecord("P1", ("research",))
-    >>> derive_session_id(datetime(2026, 1, 1, tzinfo=UTC), 3, {"rig": "flash"}, subject)[:8]
-    'ID8'
+    >>> len(derive_session_id(datetime(2026, 1, 1, tzinfo=UTC), 3, {"rig": "flash"}, subject))
+    32
     """
     content = {
         "created_at": created.isoformat(),
@@ -332,7 +332,7 @@ def drive_plan(
     signal: Callable[[Any, str], None] | None = None,
     **run: Any,
 ) -> float:
-    """Run a session's plan through the drivers in a world registered under its id, and close it.
+    """Run a session's plan through the drivers in a simulated world, and close it.
 
     Parameters
     ----------

@@ -5,12 +5,43 @@ be in a session, so the log is a hidden file next to the folder of the ground tr
 """
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from capture.session import FrameRecord, Session
 from skinrig.simulating.orders import SimulationError
+
+
+def repair_lines(path: Path) -> list[dict[str, Any]]:
+    r"""Return the documents of a log, one per line, and cut off what an interruption left.
+
+    The first line that is not a complete document ends the log.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     log = Path(folder) / "log.jsonl"
+    ...     _ = log.write_bytes(b'{"a": 1}\n{"a":')
+    ...     repair_lines(log), log.read_bytes()
+    ([{'a': 1}], b'{"a": 1}\n')
+    """
+    text = path.read_bytes() if path.is_file() else b""
+    found: list[dict[str, Any]] = []
+    end = 0
+    for line in text.splitlines(keepends=True):
+        try:
+            entry = json.loads(line) if line.endswith(b"}\n") else None
+        except ValueError:
+            entry = None
+        if not isinstance(entry, dict):
+            os.truncate(path, end)
+            break
+        found.append(entry)
+        end += len(line)
+    return found
 
 
 class ExposureLog:
@@ -28,20 +59,19 @@ class ExposureLog:
         self._path = path
         if not resume:
             path.unlink(missing_ok=True)
+        repair_lines(path)
         path.touch()  # a missing log is a lost one
 
     def add(self, entry: Mapping[str, Any]) -> None:
-        """Append an entry."""
+        """Append an entry, and flush it to the medium: its frame is committed later."""
         with self._path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(dict(entry)) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
 
     def read(self) -> list[dict[str, Any]]:
         """Return all complete entries, the oldest first."""
-        if not self._path.is_file():
-            return []
-        lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
-        # an interruption may truncate the last line; the frame of that line was not committed
-        return [json.loads(line) for line in lines if line.endswith("}\n")]
+        return repair_lines(self._path)
 
     def remove(self) -> None:
         """Remove the log, after the ground truth was written."""

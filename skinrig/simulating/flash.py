@@ -1,8 +1,10 @@
 """Simulate captures with the flash rig: a face or a target, with the ground truth."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 from capture.plan import Plan
@@ -73,7 +75,7 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     texels = subject_records.choose_face_texels(width)
     if target is None and texels != subject_records.FACE_TEXELS:
         settings["texels"] = texels
-    states_of = _StateScenes(_scene_makers(rig, order, plan), order)
+    states_of = _StateScenes(_scene_makers(rig, order, plan), order, plan)
     first = states_of.first
     session = open_session(order, plan, rig, settings, first)
     states_of.with_oxygenation = any("light" in step.settings for step in plan.steps)
@@ -100,8 +102,13 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
 class _StateScenes:
     """Scenes of a face by state; those that are left give way, as many would need much memory."""
 
-    def __init__(self, makers: Mapping[str, Callable[[], Any]], order: FlashOrder) -> None:
+    def __init__(
+        self, makers: Mapping[str, Callable[[], Any]], order: FlashOrder, plan: Plan
+    ) -> None:
         self._makers, self._order = makers, order
+        states = [str(step.index.get("state", "")) for step in plan.steps]
+        # a plan with repeats returns to its states
+        self._visits_left = Counter(state for state, _ in groupby(filter(None, states)))
         self._scenes: dict[str, Any] = {}
         self._truths: dict[str, SkinAppearance] = {}
         self.with_oxygenation = False
@@ -116,7 +123,9 @@ class _StateScenes:
         """Put the face in a state in front of the camera."""
         for left, scene in list(self._scenes.items()):
             if scene is world.scene and left != state and self._order.target is None:
-                self._truths[left] = self._leave(left)
+                self._visits_left[left] -= 1
+                if self._visits_left[left] <= 0 and left not in self._truths:
+                    self._truths[left] = self._leave(left)
         world.scene = self._scene(state)
 
     def describe(self, state: str, session_hash: str) -> SkinAppearance:

@@ -35,9 +35,12 @@ from capture.session.manifest import decode
 from capture.session.view import check_file
 from rigsim.arrays import UInt16Array
 from rigsim.world import World
+from skinrig.simulating.exposure_log import repair_lines
 from skinrig.simulating.orders import SimulationError, SimulationResult
 
 LOG_FILE = "exposures.jsonl"
+DIGEST_BYTES = 32
+"""Length of the digest before a stored image."""
 
 
 def exposures_folder(session: Path) -> Path:
@@ -56,7 +59,7 @@ class ExposureStore:
 
     An image is written before its frame is committed and removed afterwards, so that a killed
     simulation computes at most one exposure twice. Nothing is flushed to the medium: after a power
-    cut, missing images are computed again.
+    cut, images that are missing or damaged are computed again.
 
     Parameters
     ----------
@@ -69,11 +72,9 @@ class ExposureStore:
         self._files: dict[str, str] = {}
         self._keys: dict[str, str] = {}
         folder.mkdir(mode=0o700, exist_ok=True)
-        log = folder / LOG_FILE
-        lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.is_file() else []
-        # an interruption may truncate the last line; its image is still there
-        for entry in (json.loads(line) for line in lines if line.endswith("}\n")):
-            self._files[entry["exposure"]] = entry["file"]
+        # an interruption may cut the last line; its image is still there
+        for entry in repair_lines(folder / LOG_FILE):
+            self._files[str(entry["exposure"])] = str(entry["file"])
 
     @staticmethod
     def key(view_name: str, seed: int) -> str:
@@ -82,24 +83,36 @@ class ExposureStore:
 
     def find(self, key: str, session: ReplayedSession) -> UInt16Array | None:
         """Return the image of an earlier exposure, (H, W) uint16; None when it is unknown."""
-        path = self._folder / f"{key}.npy"
-        image: UInt16Array | None = None
-        if path.is_file():
-            image = np.load(path, allow_pickle=False)
-        elif (file := self._files.get(key)) is not None:
+        image = self._load(key)
+        if image is None and (file := self._files.get(key)) is not None:
             image = session.read_recorded(file)
         if image is not None:
             self._keys[_digest(image)] = key
         return image
 
+    def _load(self, key: str) -> UInt16Array | None:
+        """Return a stored image; None when there is none, or when it is damaged."""
+        path = self._folder / f"{key}.npy"
+        try:
+            with path.open("rb") as stream:
+                digest = stream.read(DIGEST_BYTES).decode("ascii")
+                image: UInt16Array = np.load(stream, allow_pickle=False)
+        except (OSError, EOFError, ValueError):
+            image, digest = np.zeros(0, np.uint16), ""
+        if digest == _digest(image):
+            return image
+        path.unlink(missing_ok=True)
+        return None
+
     def add(self, key: str, image: UInt16Array) -> None:
         """Store an image until it is committed."""
-        path = self._folder / f"{key}.npy"
+        path, digest = self._folder / f"{key}.npy", _digest(image)
         part = path.with_suffix(".part")
         with part.open("wb") as stream:
+            stream.write(digest.encode("ascii"))
             np.save(stream, image, allow_pickle=False)
         part.rename(path)
-        self._keys[_digest(image)] = key
+        self._keys[digest] = key
 
     def note_commit(self, file: str, blob: bytes) -> None:
         """Record the file of a committed image, and remove the image from the store."""

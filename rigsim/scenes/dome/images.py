@@ -55,7 +55,7 @@ class ImageFile:
     Parameters
     ----------
     folder
-        Where the file lies.
+        Folder of the file.
     most_bytes
         Maximum size of the file.
 

@@ -245,7 +245,7 @@ class TargetScene(RigScene):
         return out
 
     def _seen_plate(self, view: View) -> printed_plate.PlateImage:
-        """Return what a camera sees of the plate in its present pose."""
+        """Return the plate's points in a camera's pixels, in its present pose."""
         rays, eye = self._corner_rays(view), np.array(view.position_mm)
         how = (rays, eye, *self.plate_pose(), self._plate, EDGE_SUBPIXELS)
         return self._seen.get((view.name, self.pose), lambda: printed_plate.trace_plate(*how))

@@ -74,6 +74,11 @@ def test_resumed_session_has_bytes_of_uninterrupted_session(tmp_path, monkeypatc
             commit_only(patch, (count, count + 2, None)[number])
             with pytest.raises(Enough) if number < 2 else nullcontext():
                 simulate_session(rig, tmp_path / "parts", resume=number > 0, **ASKED[rig])
+        if number < 2:  # images of committed frames are removed at once
+            session = Session.open(tmp_path / "parts")
+            left = {path.name for path in (tmp_path / ".parts.exposures").glob("*.npy")}
+            assert len(left) <= len(session.pending_frames())
+            assert len(session.frames()) >= count
     whole, parts = read_files(tmp_path / "whole"), read_files(tmp_path / "parts")
     assert whole.keys() == parts.keys()
     assert [key for key in whole if whole[key] != parts[key]] == []
