@@ -20,6 +20,7 @@ SEAL_FILE = "consent.seal"
 UNSEALED_STATE = "unsealed"
 UNCHECKED_STATE = f"sealed, not checked without {KEY_VARIABLE}"
 SEALED_STATE = "sealed with the key"
+REFUSED_STATE = "seal refused"
 MIN_KEY_BYTES, MAX_KEY_BYTES = 32, 4096
 MAX_SEAL_BYTES = 256
 _PURPOSE = b"skinrig.consent-seal/1\n"

@@ -28,6 +28,7 @@ from capture.session import (
 )
 from capture.session.consent_seal import (
     KEY_VARIABLE,
+    REFUSED_STATE,
     SEAL_FILE,
     SEALED_STATE,
     UNCHECKED_STATE,
@@ -183,7 +184,10 @@ def test_command_seals_older_session_once(make_session, key, monkeypatch, capsys
     assert main(["session", "seal", str(path)]) == 3
     assert KEY_VARIABLE in capsys.readouterr().err
     monkeypatch.setenv(KEY_VARIABLE, str(key))
-    assert "SR-SES-016" in verify(path).problems[0]
+    found = verify(path)
+    assert not found.ok
+    assert (len(found.problems), found.damage) == (1, ())
+    assert "SR-SES-016" in found.refused_seal
     for _ in range(2):
         assert main(["session", "seal", str(path)]) == 0
         assert "P042: research" in capsys.readouterr().out
@@ -285,3 +289,47 @@ def test_seal_of_interrupted_creation_is_not_taken(make_session, key, tmp_path, 
     (tmp_path / "s" / f"{SEAL_FILE}.part").write_bytes(b"half")
     monkeypatch.delenv(KEY_VARIABLE)
     assert verify(make_session()).consent_seal == UNSEALED_STATE
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_verify_checks_files_despite_refused_seal(key, make_session, capsys, wrong):
+    """A missing or wrong seal is not damage of frames, and hides none."""
+    path = make_session()
+    sound = verify(path)
+    (path / SEAL_FILE).unlink()
+    if wrong:
+        (path / SEAL_FILE).write_bytes(b"0" * 64 + b"\n")
+    found = verify(path)
+    assert not found.ok
+    assert found.damage == ()
+    assert (found.frames, found.bytes) == (sound.frames, sound.bytes)
+    assert found.frames > 0
+    assert found.consent_seal == REFUSED_STATE
+    assert main(["verify", str(path)]) == 3
+    shown = capsys.readouterr().out
+    assert f"SEAL REFUSED, {sound.frames} frames" in shown
+    assert "DAMAGED" not in shown
+    assert "damaged:" not in shown
+    frame = next((path / "frames").iterdir())
+    frame.write_bytes(frame.read_bytes()[:-1] + b"x")
+    found = verify(path)
+    assert found.frames == sound.frames - 1
+    assert len(found.damage) == 1
+    assert frame.name in found.damage[0]
+    assert main(["verify", str(path)]) == 3
+    assert "DAMAGED" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("fault", ["mode", "missing"])
+def test_unfit_key_is_not_damage(key, make_session, capsys, fault):
+    path = make_session()
+    if fault == "mode":
+        key.chmod(0o644)
+    else:
+        key.unlink()
+    with pytest.raises(SessionError, match="SR-SES-015"):
+        verify(path)
+    assert main(["verify", str(path)]) == 3
+    shown = capsys.readouterr()
+    assert "SR-SES-015" in shown.err
+    assert "DAMAGED" not in shown.out + shown.err
