@@ -1,12 +1,13 @@
 """consent.seal: a code of session.json by a key of the lab, so that others cannot widen a consent.
 
-Who edits session.json can recompute its seal and the journal's chain, but not HMAC-SHA256 without
-the key. The variable SKINRIG_CONSENT_KEY names the file of the key. Where it is set, new sessions
-are sealed, and sessions without a right seal are refused.
+A person who edits session.json can recompute its seal and the journal's chain, but not HMAC-SHA256
+without the key. The variable SKINRIG_CONSENT_KEY names the file of the key. Where it is set, new
+sessions are sealed, and sessions without a right seal are refused.
 """
 
 import hmac
 import os
+import shlex
 import stat
 from pathlib import Path
 
@@ -19,6 +20,7 @@ SEAL_FILE = "consent.seal"
 UNSEALED_STATE = "unsealed"
 UNCHECKED_STATE = f"sealed, not checked without {KEY_VARIABLE}"
 SEALED_STATE = "sealed with the key"
+REFUSED_STATE = "seal refused"
 MIN_KEY_BYTES, MAX_KEY_BYTES = 32, 4096
 MAX_SEAL_BYTES = 256
 _PURPOSE = b"skinrig.consent-seal/1\n"
@@ -43,17 +45,22 @@ def read_key() -> bytes | None:
             "is not a key", where=name, faults=faults, advice=advice, code="SR-SES-015"
         )
 
-    make = f"Make one: (umask 077; head -c 32 /dev/urandom > {name})"
+    quoted = shlex.quote(name)
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
         key = path.read_bytes() if path.is_file() else b""
-    except OSError as error:
+    except FileNotFoundError as error:
+        make = f"Make one: (umask 077; head -c 32 /dev/urandom > {quoted})"
         raise key_error(str(error.strerror), "a file", make) from error
+    except OSError as error:
+        advice = "Log in as the owner of the key, or correct the permissions of file and folder."
+        raise key_error(str(error.strerror), "a readable file", advice) from error
     if not MIN_KEY_BYTES <= len(key) <= MAX_KEY_BYTES:
         sizes = f"a file of {MIN_KEY_BYTES} to {MAX_KEY_BYTES} bytes"
-        raise key_error(f"{len(key)} bytes", sizes, make)
+        got = f"{len(key)} bytes" if path.is_file() else "not a plain file"
+        raise key_error(got, sizes, f"Set {KEY_VARIABLE} to the file of the lab's key.")
     if mode & 0o077:
-        raise key_error(f"mode {mode:o}", "mode 600", f"Run: chmod 600 {name}")
+        raise key_error(f"mode {mode:o}", "mode 600", f"Run: chmod 600 {quoted}")
     return key
 
 
@@ -86,7 +93,8 @@ def check_seal(folder: Path, manifest: bytes) -> str:
             "has no consent seal",
             where=str(folder),
             faults=[Fault(SEAL_FILE, "no file", f"a seal with the key of {KEY_VARIABLE}")],
-            advice=f"Compare its consent with the signed form, then: skinrig session seal {folder}",
+            advice="Compare its consent with the signed form, then: "
+            f"skinrig session seal {shlex.quote(str(folder))}",
             code="SR-SES-016",
         )
     if key is None:
@@ -95,8 +103,8 @@ def check_seal(folder: Path, manifest: bytes) -> str:
     if hmac.compare_digest(found, make_seal(manifest, key)):
         return SEALED_STATE
     raise SessionDamage(
-        "has another consent than was sealed",
-        where=str(folder),
+        "differs from the sealed session.json",
+        where=str(folder / "session.json"),
         faults=[Fault(SEAL_FILE, "another code", f"that of session.json by {KEY_VARIABLE}")],
         advice="Restore session.json from a copy; or another key has sealed it: use that one.",
         code="SR-SES-017",

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.documents import Fault
+from capture.session.consent_seal import MAX_SEAL_BYTES, SEAL_FILE
 from capture.session.contents import (
     ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
@@ -36,6 +37,9 @@ from capture.session.verification import N_READERS
 from capture.session.view import check_file
 
 FileLine = FrameLine | AttachmentLine
+
+Texts = dict[str, bytes]
+"""Bytes of the manifest, of the consent's seal where there is one, and of the journal, by name."""
 
 _CONTINUE = "Free space or repair the disk, then run the same command again: it continues."
 
@@ -123,17 +127,16 @@ def copy_session(
         )
         if lost is not None:
             raise lost
-        manifest, journal = _read_texts(place, contents)
+        texts = _read_texts(place, contents)
         part = part_folder(target)
-        with (
-            DiskErrors(target, advice=_CONTINUE),
-            _locked_part(part, manifest, contents, disk) as stamp,
-        ):
+        with DiskErrors(target, advice=_CONTINUE), _locked_part(part, contents, disk) as journal:
+            _require_free(place, target)  # again, under the lock
+            stamp = _stamp_part(part, texts[MANIFEST_FILE], disk)
             writer = _FileWriter(place, part, disk, read_back)
             kept = writer.write_all(contents.file_lines, progress)
-            if _read_texts(place, read_undamaged_contents(place)) != (manifest, journal):
+            if _read_texts(place, read_undamaged_contents(place)) != texts:
                 raise _changed_error(place)
-            _write_texts(disk, part, stamp, manifest, journal, read_back=read_back)
+            _write_texts(disk, part, stamp, journal, texts, read_back=read_back)
             disk.rename(part, target)
             disk.fsync_dir(target.resolve().parent)
     return CopyReport(
@@ -215,85 +218,107 @@ def drop_from_cache(path: Path) -> None:
         os.close(descriptor)
 
 
-def _read_texts(place: Path, contents: SessionContents) -> tuple[bytes, bytes]:
-    """Return the bytes of the manifest and of the journal's valid lines."""
-    manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, label="manifest")
+def _read_texts(place: Path, contents: SessionContents) -> Texts:
+    """Return the texts of a session, the journal without a line that is cut off."""
+    texts = {
+        MANIFEST_FILE: read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, label="manifest")
+    }
+    if os.path.lexists(place / SEAL_FILE):
+        texts[SEAL_FILE] = read_file(place / SEAL_FILE, limit=MAX_SEAL_BYTES, label="consent seal")
     journal = read_file(place / JOURNAL_FILE, limit=MAX_JOURNAL_BYTES, label="journal")
-    return manifest, journal[: contents.walk.end]
+    return texts | {JOURNAL_FILE: journal[: contents.walk.end]}
 
 
 def _write_texts(
-    disk: Disk, part: Path, stamp: Path, manifest: bytes, journal: bytes, *, read_back: bool
+    disk: Disk, part: Path, stamp: Path, journal: int, texts: Texts, *, read_back: bool
 ) -> None:
-    """Write the journal, give the manifest its name, and read both back."""
-    if (part / JOURNAL_FILE).exists():
-        disk.remove(part / JOURNAL_FILE)
-    write_new(disk, part / JOURNAL_FILE, journal)
+    """Write seal and journal, give the manifest its name, and read all back."""
+    if os.path.lexists(part / SEAL_FILE):
+        disk.remove(part / SEAL_FILE)
+    if SEAL_FILE in texts:
+        write_new(disk, part / SEAL_FILE, texts[SEAL_FILE])
+    disk.truncate(journal, 0)
+    disk.write(journal, texts[JOURNAL_FILE])
+    disk.fsync(journal)
     if stamp.name != MANIFEST_FILE:
         disk.rename(stamp, part / MANIFEST_FILE)
     disk.fsync_dir(part)
     if read_back:
-        for name in (MANIFEST_FILE, JOURNAL_FILE):
+        for name in texts:
             drop_from_cache(part / name)
-    if _read_texts(part, read_contents(part)) != (manifest, journal):
-        raise _not_as_written(part)
+    # compared before anything is parsed: a byte that the disk changed is the disk's fault
+    for name, text in texts.items():
+        if read_file(part / name, limit=MAX_JOURNAL_BYTES, label=name) != text:
+            if name != JOURNAL_FILE:  # the next call rewrites the journal in place, under its lock
+                disk.remove(part / name)
+            raise _not_as_written(part / name)
 
 
 @contextmanager
 def _locked_source(place: Path, disk: Disk) -> Iterator[None]:
-    """Keep writers from a session that is open."""
+    """Keep writers from a session that is open; it need not be writable."""
     if read_contents(place).walk.closed:
         yield
         return
     descriptor = os.open(place / JOURNAL_FILE, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
-        if not disk.lock(descriptor):
-            what, advice = "another process is writing this session", "Wait for its end."
-            raise SessionLocked(what, where=str(place), advice=advice, code="SR-SES-003")
+        if not disk.lock(descriptor, shared=True):
+            raise _locked_error(place)
         yield
     finally:
         disk.close(descriptor)
 
 
 @contextmanager
-def _locked_part(
-    part: Path, manifest: bytes, contents: SessionContents, disk: Disk
-) -> Iterator[Path]:
-    """Make or take up the folder of an unfinished copy; yield the file that names its session."""
-    stamp = part / f"{MANIFEST_FILE}.part"
-    if (part / MANIFEST_FILE).exists():  # interrupted before the folder got its name
-        stamp = part / MANIFEST_FILE
+def _locked_part(part: Path, contents: SessionContents, disk: Disk) -> Iterator[int]:
+    """Make or take up the folder of an unfinished copy; yield its journal, locked and open.
+
+    The journal is never removed while the copy is unfinished: a lock on a removed file would not
+    keep a second copy away.
+    """
     folders = [FRAMES_FOLDER, ORPHANS_FOLDER]
     folders += [ATTACHMENTS_FOLDER] if contents.attachment_lines else []
     for folder in (part, *(part / name for name in folders)):
         if not folder.is_dir():
             disk.make_dir(folder)
-    if not stamp.exists():
-        write_new(disk, stamp, manifest)
-    descriptor = os.open(stamp, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    descriptor = disk.open_update(part / JOURNAL_FILE)
     try:
         if not disk.lock(descriptor):
-            raise SessionLocked(
-                "another process is writing this session",
-                where=str(part),
-                advice="Wait for its end.",
-                code="SR-SES-003",
-            )
-        written = read_file(stamp, limit=MAX_MANIFEST_BYTES, label="manifest")
-        if written != manifest:
-            if not manifest.startswith(written):
-                raise SessionError(
-                    "is the unfinished copy of another session",
-                    where=str(part),
-                    faults=[Fault(stamp.name, "another manifest", "that of the session")],
-                    advice="Remove the folder, or choose another name for the copy.",
-                    code="SR-SES-019",
-                )
-            disk.remove(stamp)  # cut off by an interruption
-            write_new(disk, stamp, manifest)
-        yield stamp
+            raise _locked_error(part)
+        yield descriptor
     finally:
         disk.close(descriptor)
+
+
+def _stamp_part(part: Path, manifest: bytes, disk: Disk) -> Path:
+    """Write the manifest of an unfinished copy, or compare the one there; return its path."""
+    stamp = part / f"{MANIFEST_FILE}.part"
+    if (part / MANIFEST_FILE).exists():  # interrupted before the folder got its name
+        stamp = part / MANIFEST_FILE
+    if stamp.exists():
+        written = read_file(stamp, limit=MAX_MANIFEST_BYTES, label="manifest")
+        if written == manifest:
+            return stamp
+        if not manifest.startswith(written):
+            raise SessionError(
+                "is the unfinished copy of another session",
+                where=str(part),
+                faults=[Fault(stamp.name, "another manifest", "that of the session")],
+                advice="Remove the folder, or choose another name for the copy.",
+                code="SR-SES-019",
+            )
+        disk.remove(stamp)  # cut off by an interruption
+    write_new(disk, stamp, manifest)
+    return stamp
+
+
+def _locked_error(path: Path) -> SessionLocked:
+    return SessionLocked(
+        "another process is writing this session",
+        where=str(path),
+        advice="Wait for its end.",
+        code="SR-SES-003",
+    )
 
 
 def _require_free(place: Path, target: Path) -> None:

@@ -34,6 +34,11 @@ class Disk:
         """Open an existing file for appending; a symbolic link is an error."""
         return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
 
+    def open_update(self, path: Path) -> int:
+        """Open a file for reading and writing, a new one if none exists; no symbolic link."""
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+        return os.open(path, flags, 0o600)
+
     def write(self, descriptor: int, data: bytes) -> None:
         """Write all of ``data``, in one system call unless the kernel takes less."""
         rest = memoryview(data)
@@ -72,10 +77,14 @@ class Disk:
         """Close a descriptor; a lock held through it is released."""
         os.close(descriptor)
 
-    def lock(self, descriptor: int) -> bool:
-        """Acquire the writer's lock; False when another process has it."""
+    def lock(self, descriptor: int, *, shared: bool = False) -> bool:
+        """Acquire the writer's lock, or one that excludes writers only; False when refused.
+
+        NFS locks a file exclusively only through a descriptor that can write.
+        """
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         return True

@@ -81,12 +81,18 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
 
 
 def write_consent_seal(disk: Disk, path: Path, manifest: bytes) -> None:
-    """Write the seal of a manifest where a key is set; the caller flushes its name."""
-    if (key := read_key()) is None:
+    """Write the seal of a manifest where a key is set; the caller flushes its name.
+
+    Without a key, a seal that an interrupted creation left is removed: it is of another manifest.
+    """
+    key, part = read_key(), path / f"{SEAL_FILE}.part"
+    for name in (part, path / SEAL_FILE) if key is None else (part,):
+        if os.path.lexists(name):
+            disk.remove(name)
+    if key is None:
         return
-    if (path / SEAL_FILE).exists():  # left over from an interrupted creation
-        disk.remove(path / SEAL_FILE)
-    write_new(disk, path / SEAL_FILE, make_seal(manifest, key))
+    write_new(disk, part, make_seal(manifest, key))
+    disk.rename(part, path / SEAL_FILE)
 
 
 def seal_consent(path: str | Path, *, disk: Disk | None = None) -> SessionContents:
@@ -110,7 +116,7 @@ def seal_consent(path: str | Path, *, disk: Disk | None = None) -> SessionConten
             advice=f"Set {KEY_VARIABLE}.",
             code="SR-SES-018",
         )
-    sealed = (place / SEAL_FILE).exists()
+    sealed = os.path.lexists(place / SEAL_FILE)
     contents = read_contents(place, sealing=not sealed)
     if contents.walk.damage is not None:
         raise contents.walk.damage
@@ -144,7 +150,8 @@ def require_free(path: Path) -> None:
         raise _occupied_error(path, "parent", "no such folder", "an existing folder")
     if not path.exists():
         return
-    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part", SEAL_FILE}
+    debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, SEAL_FILE}
+    debris |= {f"{MANIFEST_FILE}.part", f"{SEAL_FILE}.part"}
     found = {entry.name for entry in os.scandir(path)}
     filled = any(
         any((path / folder).iterdir())

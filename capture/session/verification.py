@@ -7,18 +7,26 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 
-from capture.session.consent_seal import SEAL_FILE, UNSEALED_STATE
+from capture.session.consent_seal import (
+    REFUSED_STATE,
+    SEAL_FILE,
+    UNSEALED_STATE,
+    check_seal,
+    read_key,
+)
 from capture.session.contents import (
     ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
     JOURNAL_FILE,
     MANIFEST_FILE,
+    MAX_MANIFEST_BYTES,
     ORPHANS_FOLDER,
     SessionContents,
     find_lost_lines,
     read_contents,
     unlisted_files,
 )
+from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionError
 from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.view import check_file
@@ -36,9 +44,9 @@ class VerifyReport:
     """Result of a verification."""
 
     ok: bool
-    """Whether every committed byte is as it was written."""
+    """Whether every committed byte is as it was written, and no seal is refused."""
     problems: tuple[str, ...]
-    """Damage: one entry per file (with the byte, where it is known)."""
+    """Refused seal first, then damage: one entry per file (with the byte, where it is known)."""
     warnings: tuple[str, ...]
     """Findings that matter to a person although nothing is damaged."""
     frames: int
@@ -49,6 +57,13 @@ class VerifyReport:
     """Whether the journal has a line for each file but one that an interruption may leave."""
     consent_seal: str = UNSEALED_STATE
     """Whether a key of the lab has sealed the consent, and whether the seal was checked."""
+    refused_seal: str = ""
+    """Error of a missing or wrong seal where a key is set, empty for none."""
+
+    @property
+    def damage(self) -> tuple[str, ...]:
+        """Problems without that of the seal: an unsealed session may be intact."""
+        return self.problems[1:] if self.refused_seal else self.problems
 
 
 def verify(
@@ -73,6 +88,8 @@ def verify(
     ------
     NotASession
         When the folder is not a session.
+    SessionError
+        When a key of the lab is set and its file cannot be used.
 
     Notes
     -----
@@ -85,12 +102,19 @@ def verify(
     place = Path(path)
     problems: list[str] = []
     warnings: list[str] = []
+    read_key()  # an unfit key is not damage of the session
     try:
-        contents = read_contents(place)
+        contents = read_contents(place, sealing=True)
+        manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, label="manifest")
     except NotASession:
         raise
     except SessionError as exc:
         return VerifyReport(False, (str(exc),), (), 0, 0)
+    try:
+        sealed, refused = check_seal(place, manifest), ""
+    except SessionError as exc:
+        sealed, refused = REFUSED_STATE, str(exc)
+        problems.append(refused)
     if contents.walk.damage is not None:
         problems.append(str(contents.walk.damage))
     frames, size = _check_files(place, contents.file_lines, problems, progress)
@@ -106,7 +130,7 @@ def verify(
     warnings.extend(_consent(contents, today or datetime.now(UTC).date()))
     return VerifyReport(
         *(not problems, tuple(problems), tuple(warnings), frames, size, lost is None),
-        contents.consent_seal,
+        *(sealed, refused),
     )
 
 

@@ -20,6 +20,8 @@ session_app = typer.Typer(cls=Commands, help="Work on a captured session.", no_a
 def verify(session: Path, /, json: options.Json = False) -> None:
     """Check the digests of all files of a session; exit code 3 if one is damaged or missing.
 
+    Where SKINRIG_CONSENT_KEY is set, also exit code 3 if the consent's seal is missing or wrong.
+
     Example: skinrig verify session
 
     Parameters
@@ -32,8 +34,11 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     console = Console(json)
     found = check(session, progress=console.progress)
     console.print_each("warning", found.warnings)
-    console.print_each("damaged", found.problems)
-    state = "sound" if found.ok else "DAMAGED" if found.complete else "INCOMPLETE"
+    console.print_each("refused", [found.refused_seal] if found.refused_seal else [])
+    console.print_each("damaged", found.damage)
+    state = "sound" if found.ok else "SEAL REFUSED"
+    if found.damage:
+        state = "DAMAGED" if found.complete else "INCOMPLETE"
     console.print_line(
         f"{session}: {state}, {format_count(found.frames, 'frame')}, {found.bytes / 1e6:.1f} MB"
     )

@@ -12,6 +12,7 @@ from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, SubjectRecord
+from capture.session.consent_seal import KEY_VARIABLE, SEAL_FILE
 from capture.session.copying import copy_session
 
 FORK = multiprocessing.get_context("fork")
@@ -60,10 +61,15 @@ def copy_in_child(source, target):
 
 
 @pytest.mark.long
-def test_killed_copy_continues_to_equal_bytes(tmp_path):
+def test_killed_copy_continues_to_equal_bytes(tmp_path, monkeypatch):
+    key = tmp_path / "consent.key"
+    key.write_bytes(bytes(range(32)))
+    key.chmod(0o600)
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
     source = tmp_path / "s"
     write_session(source)
     expected = read_files(source)
+    assert SEAL_FILE in expected
     begun = time.perf_counter()
     copy_in_child(source, tmp_path / "whole").join()
     whole_s = time.perf_counter() - begun

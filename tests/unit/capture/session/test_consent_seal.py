@@ -1,8 +1,15 @@
-"""A key of the lab: who lacks it cannot widen a consent, whatever he recomputes."""
+"""A key of the lab: a person without it cannot widen a consent by any recomputation."""
 
+import contextlib
+import errno
 import json
+import os
+import re
+import shlex
 import shutil
 import stat
+import subprocess
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -10,18 +17,31 @@ import pytest
 from capture import raw
 from capture.plan import flash_plan
 from capture.rig import load_rig
-from capture.session import Session, SessionDamage, SessionError, SubjectRecord, reopen_copy, verify
+from capture.session import (
+    Session,
+    SessionDamage,
+    SessionDiskError,
+    SessionError,
+    SubjectRecord,
+    reopen_copy,
+    verify,
+)
 from capture.session.consent_seal import (
     KEY_VARIABLE,
+    REFUSED_STATE,
     SEAL_FILE,
     SEALED_STATE,
     UNCHECKED_STATE,
     UNSEALED_STATE,
+    read_key,
 )
 from capture.session.contents import read_contents
+from capture.session.folder import seal_consent
 from capture.session.journal import seal_line
 from capture.session.manifest import seal
 from skinrig.cli import main
+from skinrig.soaking.host_life import HostKilled
+from skinrig.soaking.storage import DISK_FAULTS, FaultyDisk
 
 RIG = load_rig("flash").resized(16)
 
@@ -94,8 +114,8 @@ def test_forged_chain_of_sealed_consent_is_refused(key, make_session, tmp_path, 
     forge(path)
     found = verify(path)
     assert not found.ok
-    assert "another consent than was sealed" in found.problems[0]
-    with pytest.raises(SessionDamage, match="another consent"):
+    assert "differs from the sealed session.json" in found.problems[0]
+    with pytest.raises(SessionDamage, match=r"differs from the sealed session\.json"):
         Session.open(path)
     assert main(["verify", str(path)]) == 3
     assert export(path, tmp_path / "out", form) == 3
@@ -140,7 +160,9 @@ def test_another_key_does_not_open_a_session(key, make_session):
 def test_seal_is_its_owners_and_without_key(key, make_session):
     path = make_session()
     assert stat.S_IMODE((path / SEAL_FILE).stat().st_mode) == 0o600
-    assert key.read_bytes() not in (path / SEAL_FILE).read_bytes()
+    sealed = (path / SEAL_FILE).read_bytes()
+    for secret in (key.read_bytes(), key.read_bytes().hex().encode()):
+        assert secret not in sealed
     assert verify(path).warnings == ()
 
 
@@ -162,7 +184,10 @@ def test_command_seals_older_session_once(make_session, key, monkeypatch, capsys
     assert main(["session", "seal", str(path)]) == 3
     assert KEY_VARIABLE in capsys.readouterr().err
     monkeypatch.setenv(KEY_VARIABLE, str(key))
-    assert "SR-SES-016" in verify(path).problems[0]
+    found = verify(path)
+    assert not found.ok
+    assert (len(found.problems), found.damage) == (1, ())
+    assert "SR-SES-016" in found.refused_seal
     for _ in range(2):
         assert main(["session", "seal", str(path)]) == 0
         assert "P042: research" in capsys.readouterr().out
@@ -197,3 +222,114 @@ def test_unfit_key_is_refused_before_a_session(
     with pytest.raises(SessionError, match=fault or "No such file"):
         make_session()
     assert not (tmp_path / "s").exists()
+
+
+def test_key_command_is_quoted_and_for_missing_file(tmp_path, monkeypatch):
+    """The printed command makes a key; nothing is printed that would write over a file."""
+    path = tmp_path / "a lab's key; touch x"
+    monkeypatch.setenv(KEY_VARIABLE, str(path))
+    with pytest.raises(SessionError, match="Make one") as caught:
+        read_key()
+    command = re.search(r"Make one: (.*) \[", str(caught.value)).group(1)
+    subprocess.run(["sh", "-c", command], check=True, cwd=tmp_path)
+    assert len(read_key()) == 32
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    path.chmod(0o640)
+    with pytest.raises(SessionError, match=re.escape(f"chmod 600 {shlex.quote(str(path))}")):
+        read_key()
+    path.write_bytes(b"short")
+    with pytest.raises(SessionError, match="5 bytes") as caught:
+        read_key()
+    assert "Make one" not in str(caught.value)
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path))
+    with pytest.raises(SessionError, match="not a plain file"):
+        read_key()
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EIO])
+def test_unreadable_key_is_not_replaced(key, monkeypatch, code):
+    def refuse(path):
+        raise OSError(code, os.strerror(code), str(path))
+
+    monkeypatch.setattr(type(key), "read_bytes", refuse)
+    with pytest.raises(SessionError, match=os.strerror(code)) as caught:
+        read_key()
+    assert "Make one" not in str(caught.value)
+
+
+@pytest.mark.parametrize("fault", DISK_FAULTS)
+def test_fault_while_sealing_leaves_no_wrong_seal(make_session, key, tmp_path, monkeypatch, fault):
+    """At each operation of `seal_consent`; the same command then seals."""
+    monkeypatch.delenv(KEY_VARIABLE)
+    made = make_session()
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
+    struck = Counter()
+    while True:
+        path = tmp_path / f"s{struck.total()}"
+        shutil.copytree(made, path)
+        disk = FaultyDisk(tmp_path, strike=struck.total() + 1, fault=fault)
+        with contextlib.suppress(SessionDiskError, HostKilled):
+            seal_consent(path, disk=disk)
+        disk.close_all()
+        if not disk.struck:
+            break
+        struck[disk.struck] += 1
+        if (path / SEAL_FILE).exists():
+            assert verify(path).consent_seal == SEALED_STATE
+        assert seal_consent(path).consent_seal == SEALED_STATE
+        assert verify(path).warnings == ()  # no part of a seal is left
+    assert {"create", "write", "fsync", "rename", "fsync_dir"} <= set(struck)
+
+
+def test_seal_of_interrupted_creation_is_not_taken(make_session, key, tmp_path, monkeypatch):
+    """A later session in the same folder, made without the key, is not sealed."""
+    other = make_session("other")
+    (tmp_path / "s").mkdir()
+    shutil.copy(other / SEAL_FILE, tmp_path / "s")
+    (tmp_path / "s" / f"{SEAL_FILE}.part").write_bytes(b"half")
+    monkeypatch.delenv(KEY_VARIABLE)
+    assert verify(make_session()).consent_seal == UNSEALED_STATE
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_verify_checks_files_despite_refused_seal(key, make_session, capsys, wrong):
+    """A missing or wrong seal is not damage of frames, and hides none."""
+    path = make_session()
+    sound = verify(path)
+    (path / SEAL_FILE).unlink()
+    if wrong:
+        (path / SEAL_FILE).write_bytes(b"0" * 64 + b"\n")
+    found = verify(path)
+    assert not found.ok
+    assert found.damage == ()
+    assert (found.frames, found.bytes) == (sound.frames, sound.bytes)
+    assert found.frames > 0
+    assert found.consent_seal == REFUSED_STATE
+    assert main(["verify", str(path)]) == 3
+    shown = capsys.readouterr().out
+    assert f"SEAL REFUSED, {sound.frames} frames" in shown
+    assert "DAMAGED" not in shown
+    assert "damaged:" not in shown
+    frame = next((path / "frames").iterdir())
+    frame.write_bytes(frame.read_bytes()[:-1] + b"x")
+    found = verify(path)
+    assert found.frames == sound.frames - 1
+    assert len(found.damage) == 1
+    assert frame.name in found.damage[0]
+    assert main(["verify", str(path)]) == 3
+    assert "DAMAGED" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("fault", ["mode", "missing"])
+def test_unfit_key_is_not_damage(key, make_session, capsys, fault):
+    path = make_session()
+    if fault == "mode":
+        key.chmod(0o644)
+    else:
+        key.unlink()
+    with pytest.raises(SessionError, match="SR-SES-015"):
+        verify(path)
+    assert main(["verify", str(path)]) == 3
+    shown = capsys.readouterr()
+    assert "SR-SES-015" in shown.err
+    assert "DAMAGED" not in shown.out + shown.err

@@ -1,6 +1,7 @@
 """A second copy of a session: equal bytes, or one error that names the file."""
 
 import errno
+import fcntl
 import os
 
 import numpy as np
@@ -19,6 +20,7 @@ from capture.session import (
     SubjectRecord,
     verify,
 )
+from capture.session.consent_seal import KEY_VARIABLE, SEAL_FILE, SEALED_STATE, UNCHECKED_STATE
 from capture.session.copying import copy_session, part_folder
 
 RIG = load_rig("flash").resized(16)
@@ -43,6 +45,16 @@ def write_session(path, *, frames=FRAMES, close=True, session_id="copied"):
     if close:
         session.close(missing_reason="" if frames == FRAMES else "stopped")
     session.release()
+    return path
+
+
+@pytest.fixture
+def key(tmp_path_factory, monkeypatch):
+    """The file of a lab's key, which is set."""
+    path = tmp_path_factory.mktemp("lab") / "consent.key"
+    path.write_bytes(bytes(range(32)))
+    path.chmod(0o600)
+    monkeypatch.setenv(KEY_VARIABLE, str(path))
     return path
 
 
@@ -75,6 +87,16 @@ class FailingDisk(Disk):
                 raise OSError(self.code, os.strerror(self.code))
             data = bytes(data)[:-1] + bytes([data[-1] ^ 1])
         super().write(descriptor, data)
+
+
+class NetworkDisk(Disk):
+    """A disk that locks as NFS does: exclusively only by a descriptor that can write."""
+
+    def lock(self, descriptor, *, shared=False):
+        mode = fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE
+        if mode == (os.O_WRONLY if shared else os.O_RDONLY):
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        return super().lock(descriptor, shared=shared)
 
 
 @pytest.mark.parametrize("read_back", [False, True])
@@ -114,7 +136,7 @@ def test_copy_on_full_disk_continues_later(tmp_path, number):
     assert found.kept <= FRAMES + 1
 
 
-@pytest.mark.parametrize("number", range(2, FRAMES + 4))
+@pytest.mark.parametrize("number", range(1, FRAMES + 4))
 def test_changed_byte_of_copy_is_found(tmp_path, number):
     source = write_session(tmp_path / "s")
     with pytest.raises(SessionDamage, match=r"not as it was written|damaged"):
@@ -190,3 +212,81 @@ def test_unusable_folder_of_copy_is_refused(tmp_path, name):
     with pytest.raises(SessionError, match="SR-SES-022"):
         copy_session(source, tmp_path / name)
     assert read_files(tmp_path) == before
+
+
+@pytest.mark.parametrize("read_back", [False, True])
+@pytest.mark.parametrize("with_key", [False, True])
+def test_copy_of_sealed_session_keeps_seal(tmp_path, key, monkeypatch, read_back, with_key):
+    source = write_session(tmp_path / "s")
+    if not with_key:
+        monkeypatch.delenv(KEY_VARIABLE)
+    copy_session(source, tmp_path / "c", read_back=read_back)
+    assert read_files(tmp_path / "c") == read_files(source)
+    assert (tmp_path / "c" / SEAL_FILE).is_file()
+    found = verify(tmp_path / "c")
+    assert found.ok
+    assert found.consent_seal == (SEALED_STATE if with_key else UNCHECKED_STATE)
+    monkeypatch.setenv(KEY_VARIABLE, str(key))
+    assert verify(tmp_path / "c").consent_seal == SEALED_STATE
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, None])
+@pytest.mark.parametrize("number", range(1, FRAMES + 5))
+def test_failed_copy_of_sealed_session_continues(tmp_path, key, code, number):
+    source = write_session(tmp_path / "s")
+    with pytest.raises((SessionDiskError, SessionDamage)):
+        copy_session(source, tmp_path / "c", read_back=True, disk=FailingDisk(number, code=code))
+    assert not (tmp_path / "c").exists()
+    copy_session(source, tmp_path / "c", read_back=True)
+    assert read_files(tmp_path / "c") == read_files(source)
+
+
+def test_unfinished_copy_drops_seal_of_before(tmp_path, key, monkeypatch):
+    """The seal was removed between an interrupted copy and its continuation."""
+    source = write_session(tmp_path / "s")
+    with pytest.raises(SessionDiskError):
+        copy_session(source, tmp_path / "c", disk=FailingDisk(FRAMES + 4, code=errno.ENOSPC))
+    assert (part_folder(tmp_path / "c") / SEAL_FILE).exists()
+    (source / SEAL_FILE).unlink()
+    monkeypatch.delenv(KEY_VARIABLE)
+    copy_session(source, tmp_path / "c")
+    assert read_files(tmp_path / "c") == read_files(source)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("close", [False, True])
+def test_second_copy_to_same_place_is_refused(tmp_path, cut, close):
+    """Also when the first continues a copy whose manifest was cut off."""
+    source = write_session(tmp_path / "s", close=close)
+    refused = []
+    if cut:
+        with pytest.raises(SessionDiskError):
+            copy_session(source, tmp_path / "c", disk=FailingDisk(1, code=errno.ENOSPC))
+        stamp = part_folder(tmp_path / "c") / "session.json.part"
+        stamp.write_bytes((source / "session.json").read_bytes()[:100])
+
+    def copy_again(_):
+        with pytest.raises(SessionLocked, match=r"\.c\.copying"):
+            copy_session(source, tmp_path / "c")
+        refused.append(True)
+
+    copy_session(source, tmp_path / "c", progress=copy_again)
+    assert len(refused) == FRAMES + 1
+    assert read_files(tmp_path / "c") == read_files(source)
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_copy_locks_files_as_nfs_allows(tmp_path, close):
+    source = write_session(tmp_path / "s", close=close)
+    copy_session(source, tmp_path / "c", disk=NetworkDisk())
+    assert read_files(tmp_path / "c") == read_files(source)
+
+
+def test_open_session_is_copied_twice_at_once(tmp_path):
+    source = write_session(tmp_path / "s", frames=1, close=False)
+    copies = iter(["d", "e"])
+    copy_session(
+        source, tmp_path / "c", progress=lambda _: copy_session(source, tmp_path / next(copies))
+    )
+    for name in "cde":
+        assert read_files(tmp_path / name) == read_files(source)
