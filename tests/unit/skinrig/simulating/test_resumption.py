@@ -1,4 +1,4 @@
-"""What an interruption leaves: images of exposures, their log, and a session that is refused."""
+"""Images of exposures, their log, and a session that is refused, after an interruption."""
 
 import itertools
 
