@@ -176,10 +176,11 @@ class Rig(Document):
         return dataclasses.replace(self, views=views)
 
     def at_iso(self, factor: float) -> Rig:
-        """Return this rig with cameras of a higher ISO, and exposures that keep the levels.
+        """Return this rig with fewer electrons at full scale of its cameras, as at a higher ISO.
 
-        Each level then corresponds to fewer electrons, so that shot noise grows by
-        ``sqrt(factor)`` and read noise, relative to the level, by ``factor``.
+        Exposure times stay, and so do levels: each corresponds to fewer electrons, as if less
+        light arrived. Shot noise grows by ``sqrt(factor)`` and read noise, relative to the level,
+        by ``factor``. Cameras of the scanner stay nominal.
 
         Parameters
         ----------

@@ -4,6 +4,10 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from capture.documents import Fault, InputError
 
@@ -16,18 +20,18 @@ _IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it
 VIDEO_ADVICE = "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
 CONVERSION_ADVICE = "Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW."
 VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
-VIDEO_BRANDS = (b"isom", b"mp42", b"qt  ", b"avc1", b"M4V ")
+VIDEO_BRANDS = (b"isom", b"mp42", b"qt  ", b"avc1", b"M4V ", b"AVI ")
 OTHER_KINDS = {
     "HEIC image": ((b"heic", b"heix", b"mif1", b"msf1"), (".heic", ".heif")),
     "AVIF image": ((b"avif",), (".avif",)),
-    "WebP image": ((b"RIFF",), (".webp",)),
+    "WebP image": ((b"WEBP",), (".webp",)),
     "GIF image": ((b"GIF8",), (".gif",)),
     "BMP image": ((b"BM",), (".bmp",)),
     "Photoshop file": ((b"8BPS",), (".psd", ".psb")),
     "JPEG XL image": ((b"\xff\x0a",), (".jxl",)),
     "JPEG 2000 image": ((b"\0\0\0\x0cjP",), (".jp2", ".j2k")),
 }
-"""Formats that are not read: first bytes, or the brand of ISO base media, and suffixes."""
+"""Formats that are not read: first bytes, or the brand of ISO base media or RIFF, and suffixes."""
 OTHER_IMAGE_SUFFIXES = frozenset(one for _, suffixes in OTHER_KINDS.values() for one in suffixes)
 
 
@@ -81,9 +85,9 @@ def check_size(width: int, height: int, where: str) -> None:
         )
 
 
-def check_png(data: bytes, where: str) -> list[str]:
-    """Check the chunks of a PNG, sizes, checksums and end, and return notes on its content."""
-    at = 8
+def check_png(data: bytes, where: str) -> tuple[list[str], int]:
+    """Check the chunks of a PNG, and return notes on its content and its EXIF orientation."""
+    at, orientation = 8, 1
     kinds: set[bytes] = set()
     notes: list[str] = []
     while True:
@@ -105,17 +109,20 @@ def check_png(data: bytes, where: str) -> list[str]:
             check_size(width, height, where)
             if color in (4, 6):
                 notes.append("transparency was dropped")
+        if kind == b"eXIf":
+            found_notes, orientation = _check_exif(data[at + 8 : at + 8 + length])
+            notes += found_notes
         kinds.add(kind)
         at += 12 + length
         if kind == b"IEND":
             break
     if kinds & {b"iCCP", b"cICP"}:
         notes.append("its color profile was not applied; the colors count as sRGB")
-    return notes
+    return notes, orientation
 
 
 _EXIF_POINTER, _COLOR_SPACE_TAG, _UNCALIBRATED = 0x8769, 0xA001, 0xFFFF
-_ORIENTATION_TAG, N_ORIENTATIONS = 0x0112, 8
+ORIENTATION_TAG, N_ORIENTATIONS = 0x0112, 8
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -148,13 +155,8 @@ def check_jpeg(data: bytes, where: str) -> tuple[list[str], int]:
         if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0") and b"sRGB" not in body:
             notes.append("its color profile was not applied; the colors count as sRGB")
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
-            uncalibrated, orientation = _read_exif(body[6:])
-            if uncalibrated:
-                notes.append(
-                    "its EXIF names no sRGB (uncalibrated color); the colors count as sRGB"
-                )
-            if orientation != 1:
-                notes.append(f"the image was turned as its EXIF orientation {orientation} asks")
+            found, orientation = _check_exif(body[6:])
+            notes += found
         at += 2 + length
         if marker == 0xDA:
             break
@@ -162,6 +164,39 @@ def check_jpeg(data: bytes, where: str) -> tuple[list[str], int]:
     if not sized or data.find(b"\xff\xd9", at) < 0:
         raise cut
     return list(dict.fromkeys(notes)), orientation
+
+
+def _check_exif(tiff: bytes) -> tuple[list[str], int]:
+    """Return notes on EXIF data of a file that is decoded upright, and its orientation."""
+    uncalibrated, orientation = _read_exif(tiff)
+    notes = note_orientation(orientation)
+    if uncalibrated:
+        notes = ["its EXIF names no sRGB (uncalibrated color); the colors count as sRGB", *notes]
+    return notes, orientation
+
+
+def note_orientation(orientation: int) -> list[str]:
+    """Return the note that an image was turned upright; none for one that is stored so."""
+    if orientation == 1:
+        return []
+    return [f"the image was turned as its EXIF orientation {orientation} asks"]
+
+
+def turn_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Return stored pixels (H, W) or (H, W, C) as upright image; Exif 2.32, tag 0x0112.
+
+    Examples
+    --------
+    >>> turn_upright(np.array([[1, 2], [3, 4]]), 6).tolist()
+    [[3, 1], [4, 2]]
+    """
+    if orientation >= 5:  # rows are columns of the upright image
+        pixels = np.swapaxes(pixels, 0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels
 
 
 def _read_exif(tiff: bytes) -> tuple[bool, int]:
@@ -174,18 +209,22 @@ def _read_exif(tiff: bytes) -> tuple[bool, int]:
     found = Exif()
     try:
         found.load(b"Exif\0\0" + tiff)
-        orientation = found.get(_ORIENTATION_TAG, 1)
+        orientation = found.get(ORIENTATION_TAG, 1)
         uncalibrated = found.get_ifd(_EXIF_POINTER).get(_COLOR_SPACE_TAG) == _UNCALIBRATED
     except (SyntaxError, ValueError, struct.error, OSError):  # damaged: the pixels may be right
         return False, 1
-    known = isinstance(orientation, int) and 1 <= orientation <= N_ORIENTATIONS
-    return uncalibrated, orientation if known else 1
+    return uncalibrated, known_orientation(orientation)
+
+
+def known_orientation(value: object) -> int:
+    """Return an orientation from 1 to 8; 1 for any other value."""
+    return value if isinstance(value, int) and 1 <= value <= N_ORIENTATIONS else 1
 
 
 def require_photograph(file: Path, head: bytes) -> None:
     """Refuse images of other formats, and videos, by their first bytes or suffix."""
     suffix = file.suffix.lower()
-    brand = head[8:12] if head[4:8] == b"ftyp" else b""
+    brand = head[8:12] if head[4:8] == b"ftyp" or head[:4] == b"RIFF" else b""
     kind = next(
         (
             name

@@ -14,13 +14,17 @@ from capture import raw
 from capture.arrays import FloatArray, UInt16Array
 from capture.documents import InputError
 from capture.importers.image_checks import (
+    ORIENTATION_TAG,
     check_jpeg,
     check_png,
     check_size,
     image_error,
+    known_orientation,
+    note_orientation,
     photo_error,
     read_head,
     require_photograph,
+    turn_upright,
 )
 
 Encoding = Literal["raw", "linear", "sRGB"]
@@ -60,7 +64,7 @@ class Photo:
     """Value of a floating-point file that is stored as white, 0 for a black one; None: the file
     contains integers."""
     orientation: int = 1
-    """EXIF orientation of a JPEG, from 1 to 8, by which its pixels were turned upright."""
+    """EXIF orientation of a JPEG, PNG or TIFF, 1 to 8, by which its pixels were turned upright."""
 
 
 def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
@@ -92,7 +96,8 @@ def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
         notes, orientation = check_jpeg(file.read_bytes(), where)
         return replace(_display(file, where, "JPEG", notes), orientation=orientation)
     if head.startswith(_PNG_MAGIC):
-        return _display(file, where, "PNG", check_png(file.read_bytes(), where))
+        notes, orientation = check_png(file.read_bytes(), where)
+        return replace(_display(file, where, "PNG", notes), orientation=orientation)
     if head.startswith(_EXR_MAGIC):
         return _exr(file, where, white_value)
     if head.startswith(_TIFF_MAGICS) and file.suffix.lower() in _TIFF_SUFFIXES:
@@ -261,6 +266,7 @@ def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
                 raise image_error("is cut short", where, "TIFF", f"{size} bytes", "a whole file")
             planar = int(page.planarconfig) == 2 and page.samplesperpixel > 1
             profile = 34675 in page.tags
+            orientation = known_orientation(page.tags.valueof(ORIENTATION_TAG))
             pages = len(stream.pages)
             pixels = np.asarray(page.asarray())
     except InputError:
@@ -287,14 +293,17 @@ def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
         pixels = np.moveaxis(pixels, 0, -1)
     if profile:
         notes.append("its color profile was not applied; the colors count as sRGB primaries")
-    pixels = _channels(pixels, where, notes)
+    pixels = turn_upright(_channels(pixels, where, notes), orientation)
+    notes += note_orientation(orientation)
     if pixels.dtype == np.uint8:
-        return _from_display(pixels, where, notes)
-    if pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
-        return _linear(pixels, [*notes, "the TIFF's values count as linear light"], white_value)
-    raise image_error(
-        "has an unknown depth", where, "samples", str(pixels.dtype), "8, 16 bit or float"
-    )
+        photo = _from_display(pixels, where, notes)
+    elif pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
+        photo = _linear(pixels, [*notes, "the TIFF's values count as linear light"], white_value)
+    else:
+        raise image_error(
+            "has an unknown depth", where, "samples", str(pixels.dtype), "8, 16 bit or float"
+        )
+    return replace(photo, orientation=orientation)
 
 
 def _exr(file: Path, where: str, white_value: float | None) -> Photo:

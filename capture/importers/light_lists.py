@@ -43,6 +43,8 @@ LIST_NAMES = tuple(
     )
 )
 """Names of lists without names of images, the first that exists counts."""
+SUFFIX_PATTERN = re.compile(r"\.[a-z0-9]{1,5}$")
+"""Suffix of a folded name; what follows another dot is part of the name."""
 MAX_LIGHTS = 10_000
 UNIT_LENGTH_RANGE = (0.98, 1.02)
 """Range of lengths in which the rows of a list count as rounded unit vectors."""
@@ -159,7 +161,7 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     listed = directory / "filenames.txt"
     if listed.is_file():
         names = [line.strip() for line in read_text(listed).splitlines() if line.strip()]
-        return tuple(_find_image_file(name, directory, listed) for name in names)
+        return _find_image_files(names, directory, listed)
     images = (
         f for f in _list_files(directory) if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f)
     )
@@ -274,13 +276,30 @@ def _source(directory: Path) -> Path:
 
 def _from_lp(path: Path, directory: Path) -> LightList:
     """Read an .lp file: a count, then a file name and x y z in each line."""
-    pictures, vectors = [], []
+    names, vectors = [], []
     for number, words in _read_counted(path):
-        vectors.append(parse_vector(words[-3:], f"{path}, line {number}"))
-        pictures.append(_find_image_file(" ".join(words[:-3]), directory, path))
+        where = f"{path}, line {number}"
+        vectors.append(parse_vector(words[-3:], where))
+        if len(words) != 4:
+            raise LightListError(
+                "is not a light list",
+                where=where,
+                faults=[Fault("columns", f"{len(words)}: {' '.join(words)[:60]}", "name x y z")],
+                advice="Remove other columns. With decimal commas, separate columns by semicolons.",
+            )
+        names.append(words[0])
+    pictures = _find_image_files(names, directory, path)
+    return _list_named(path, directory, pictures, np.array(vectors))
+
+
+def _list_named(
+    path: Path, directory: Path, pictures: tuple[Path, ...], vectors: Float64Array
+) -> LightList:
+    """Return the lights of a list with names; its rows are those of the intensities, too."""
     if len(set(pictures)) < len(pictures):
         raise LightListError("contains an image twice", where=str(path))
-    return LightList(tuple(pictures), np.array(vectors), "lp", path.name)
+    intensity = read_intensities(directory, len(vectors))
+    return LightList(pictures, vectors, "lp", path.name, intensity)
 
 
 def _read_counted(path: Path) -> list[tuple[int, list[str]]]:
@@ -297,27 +316,27 @@ def _read_counted(path: Path) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _find_image_file(name: str, directory: Path, source: Path) -> Path:
-    """Return the file of an entry: by name, without its folder, or with another suffix."""
-    base = _fold(re.split(r"[\\/]", name)[-1])
+def _find_image_files(names: Sequence[str], directory: Path, source: Path) -> tuple[Path, ...]:
+    """Return the files of entries: by name, without its folder, or with another suffix."""
     files = {_fold(file.name): file for file in _list_files(directory)}
-    if base in files:
-        return files[base]
-    stem = base.rsplit(".", 1)[0]
-    alike = [
-        file
-        for file in files.values()
-        if _fold(file.stem) == stem and file.suffix.lower() in IMAGE_SUFFIXES
-    ]
-    if len(alike) == 1:
-        return alike[0]
-    raise LightListError(
-        "names a missing image",
-        where=str(source),
-        faults=[Fault("picture", repr(name), f"a file in {directory}")],
-        advice="Correct the name in the list, or add the file.",
-        code="SR-IMP-008",
-    )
+    by_stem: dict[str, list[Path]] = {}
+    for file in files.values():
+        if file.suffix.lower() in IMAGE_SUFFIXES:
+            by_stem.setdefault(_fold(file.stem), []).append(file)
+    found = []
+    for name in names:
+        base = _fold(re.split(r"[\\/]", name)[-1])
+        alike = by_stem.get(SUFFIX_PATTERN.sub("", base), [])
+        if base not in files and len(alike) != 1:
+            raise LightListError(
+                "names a missing image",
+                where=str(source),
+                faults=[Fault("picture", repr(name), f"a file in {directory}")],
+                advice="Correct the name in the list, or add the file.",
+                code="SR-IMP-008",
+            )
+        found.append(files[base] if base in files else alike[0])
+    return tuple(found)
 
 
 def _fold(name: str) -> str:
@@ -371,10 +390,8 @@ def _from_table(path: Path, directory: Path, pictures: tuple[Path, ...]) -> Ligh
     """Read vectors from JSON or NumPy, with names of images where the file has them."""
     names, vectors = read_light_table(path)
     if names:
-        pictures = tuple(_find_image_file(name, directory, path) for name in names)
-        if len(set(pictures)) < len(pictures):
-            raise LightListError("contains an image twice", where=str(path))
-        return LightList(pictures, vectors, "lp", path.name)
+        named = _find_image_files(names, directory, path)
+        return _list_named(path, directory, named, vectors)
     _require_one_each(path, pictures, vectors)
     intensity = read_intensities(directory, len(vectors))
     return LightList(pictures, vectors, "list", path.name, intensity)

@@ -54,7 +54,7 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows of a text file, with their lines from 1; comments and a header are none."""
+    """Return rows of a text file and their lines from 1; comments and a header are skipped."""
     lines = enumerate(read_text(path).splitlines(), start=1)
     rows = [
         (number, split_row(line))
@@ -68,21 +68,22 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
 
 
 def split_row(line: str) -> list[str]:
-    """Return the words of a row: semicolons, commas or spaces separate them.
+    """Return the words of a row: spaces, semicolons or commas separate them.
 
-    The last three are a vector; all in front of them is one name.
+    Three numbers between spaces are a vector; all in front of them is one name.
 
     Examples
     --------
-    >>> split_row("img 1.png;0,5;0;1"), split_row("0.5,0,1"), split_row("a b.png 0,5 0 1")
-    (['img 1.png', '0,5', '0', '1'], ['0.5', '0', '1'], ['a b.png', '0,5', '0', '1'])
+    >>> split_row("img 1.png;0,5;0;1"), split_row("0.5,0,1"), split_row("a, b.png 0,5 0 1")
+    (['img 1.png', '0,5', '0', '1'], ['0.5', '0', '1'], ['a, b.png', '0,5', '0', '1'])
     """
-    if ";" in line:
+    words = line.rsplit(maxsplit=3)
+    if len(words) >= 3 and all(map(is_number, words[-3:])):
+        words[:-3] = [name.rstrip(",;") for name in words[:-3]]
+    elif ";" in line:
         words = line.split(";")
     elif re.search(r",\s", line) or line.split()[-1].count(",") > 1:
         words = line.split(",")
-    else:
-        words = line.rsplit(maxsplit=3)
     return [word.strip().strip('"') for word in words if word.strip()]
 
 

@@ -75,16 +75,17 @@ def find_axes(normals: Float64Array, valid: BoolArray) -> Iterator[Finding]:
         measured, limit = ratio, 1.0 / CURL_RATIO
     else:
         return
-    named = _name(*best)
-    yield Finding("axes of the list", (), evidence, measured, limit, f"read the list as {named}")
+    read = _name(*best)
+    remedy = f"read the list as ({', '.join(read)})"
+    yield Finding("axes of the list", (), evidence, measured, limit, remedy, axes=read)
 
 
-def _name(axes: tuple[int, ...], signs: tuple[float, ...]) -> str:
-    """Return how rows are to be read, such as "(x, -y, z)"."""
-    parts = (
+def _name(axes: tuple[int, ...], signs: tuple[float, ...]) -> tuple[str, str, str]:
+    """Return how rows are to be read, such as ("x", "-y", "z")."""
+    x, y, z = (
         f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(axes, signs, strict=True)
     )
-    return f"({', '.join(parts)})"
+    return x, y, z
 
 
 def _curl(normals: Float64Array, valid: BoolArray) -> float:

@@ -234,7 +234,7 @@ def _find_in_images(
         )
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
     scaled = albedo[..., None] * normals
-    moved = find_moved(stack.gray[kept], stack.usable[kept], valid, scaled)
+    moved = find_moved(stack.gray[kept], stack.usable[kept], valid, scaled, step=stack.step)
     findings += [_renumbered(one, kept) for one in moved]
     height, width = mask.shape
     places = np.argwhere(valid)

@@ -24,6 +24,8 @@ class Finding:
         What the user does.
     order
         Row of the list for each image, if the finding proposes another order.
+    axes
+        Components of a row as x, y and z, such as ("-x", "y", "z"), if the finding proposes others.
     """
 
     fault: str
@@ -33,6 +35,7 @@ class Finding:
     limit: float
     remedy: str
     order: tuple[int, ...] | None = None
+    axes: tuple[str, str, str] | None = None
 
     @property
     def ratio_to_limit(self) -> float:

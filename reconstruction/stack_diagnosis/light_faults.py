@@ -24,7 +24,8 @@ SHADOW_COSINE = -0.15
 MIRROR_COSINES = (0.85, 0.65)
 """Samples with larger cosines may hold a highlight; the second limit leaves out wide lobes too."""
 MIN_KEPT_FRACTION = 0.5
-"""Of the coefficient, which highlights lose between the two limits and near lights do not."""
+"""Fraction of the coefficient that remains from the first limit to the second: highlights lose
+more, near lights do not."""
 MIN_NEAR_LIGHTS, MIN_NEAR_POINTS = 6, 50
 MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
 """Twice half a width of the object over the distance of the lights, and its certainty."""

@@ -1,4 +1,4 @@
-"""Find mirrored and moved images: their texture lies elsewhere than that of the other images.
+"""Find mirrored and moved images, whose texture has another position than in the other images.
 
 Shading alone does not show this: a mirrored image of a ball looks like another light. So every
 image is compared under the light that fits it best, straight, mirrored and shifted, and only in
@@ -18,7 +18,7 @@ from reconstruction.stack_diagnosis.finding import Finding
 FINE_PX = 4.0
 """Standard deviation of the filter whose result is subtracted: what is left is fine structure."""
 MIN_SHADING = 0.15
-"""Of the bright samples of an image; darker ones carry no structure."""
+"""Light over that of an image's bright samples, below which a sample carries no structure."""
 MAX_MIRROR_COSINE, MIN_MATTE_FRACTION = 0.85, 0.3
 """Cosine between normal and half vector from which a highlight is possible; such samples are left
 out if this fraction of the lit ones remains."""
@@ -33,7 +33,7 @@ MIN_CORRELATION, MIN_GAIN = 0.5, 0.1
 """Correlation of the fine structure of a mirrored image, and its gain over the straight one."""
 MIN_SHIFT_PX, MAX_STEP_PX = 0.7, 2.0
 MAX_SHIFT_FRACTION = 0.25
-"""Of the smaller side of an image."""
+"""Largest shift over the smaller side of an image."""
 MAX_UNEXPLAINED = 0.7
 """Variance of the fine structure that a shift leaves unexplained, over that without it."""
 MIN_SHIFT_GAIN = 0.02
@@ -50,7 +50,12 @@ class FineStructure(NamedTuple):
 
 
 def find_moved(
-    gray: Float64Array, usable: BoolArray, inside: BoolArray, scaled_normals: Float64Array
+    gray: Float64Array,
+    usable: BoolArray,
+    inside: BoolArray,
+    scaled_normals: Float64Array,
+    *,
+    step: int = 1,
 ) -> Iterator[Finding]:
     """Yield images whose fine structure fits the other images mirrored or shifted.
 
@@ -62,6 +67,8 @@ def find_moved(
         (H, W), the object.
     scaled_normals
         (H, W, 3), normals times albedo, of all images; 0 where they are not valid.
+    step
+        Pixels of the images per pixel of these arrays, in which shifts are stated.
     """
     for number, image in enumerate(gray):
         good = inside & usable[number]
@@ -78,19 +85,20 @@ def find_moved(
         if gain > MIN_GAIN and mirrored > MIN_CORRELATION:
             yield Finding(
                 "mirrored image", (number,),
-                f"fine structure of image {number + 1} mirrored correlates with the others by "
-                f"{mirrored:.2f}, as it is by {straight.correlation:.2f}",
+                f"image {number + 1}: correlation with the other images: {mirrored:.2f} mirrored, "
+                f"{straight.correlation:.2f} unmirrored",
                 gain, MIN_GAIN, "mirror the image back",
             )  # fmt: skip
             continue
         shift, unexplained = _find_shift(image, good, scaled_normals, straight)
+        shift, limit_px = step * shift, step * MIN_SHIFT_PX
         size = float(np.hypot(*shift))
-        if size > MIN_SHIFT_PX and unexplained < MAX_UNEXPLAINED:
+        if size > limit_px and unexplained < MAX_UNEXPLAINED:
             yield Finding(
                 "moved image", (number,),
                 f"image {number + 1} is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) pixels: its "
                 f"fine structure then differs {1.0 / max(unexplained, 1e-3):.1f} times less",
-                size, MIN_SHIFT_PX, "align the image with the others, or leave it out",
+                size, limit_px, "align the image with the others, or leave it out",
             )  # fmt: skip
 
 
@@ -126,6 +134,8 @@ def _relight(
 ) -> tuple[Float64Array, BoolArray]:
     """Return the shading under the light that fits an image, and where it may have highlights."""
     lit = good & (image > MIN_SHADING * np.quantile(image[good], 0.95))
+    if np.count_nonzero(lit) < MIN_SAMPLES:
+        return np.zeros(image.shape), np.zeros(image.shape, bool)
     values, rows = image[lit], scaled_normals[lit]
     weights: Float64Array = np.ones(len(values))
     light: Float64Array = np.zeros(3)

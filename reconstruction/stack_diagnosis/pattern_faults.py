@@ -19,9 +19,10 @@ PATTERN_NAMES = ("full", "x", "y", "z", "-x", "-y", "-z")
 SMOOTHING_PX = 1.5
 """Standard deviation of the filter that lowers noise before images are subtracted."""
 MIN_LIGHT = 0.2
-"""Of the bright samples; darker ones are not compared."""
+"""Light over that of the bright samples, below which a sample is not compared."""
 MIN_EXCHANGED, EXCHANGED_RATIO = 0.02, 2.0
-"""Light of the crossed image above the parallel one, over the bright level and its opposite."""
+"""Excess of the crossed over the parallel image in highlights: over the bright level, and over the
+opposite excess."""
 TAIL_QUANTILE = 0.99
 SUM_QUANTILE, MAX_SUM_ERROR = 0.9, 0.05
 """Quantile of the difference of pattern and inverse to the full light, relative, and its limit."""
@@ -199,7 +200,7 @@ def _find_exchange(images: Mapping[str, Float64Array], inside: BoolArray) -> tup
 def _find_turned(images: Mapping[str, Float64Array], inside: BoolArray) -> Iterator[Finding]:
     """Yield the axes whose patterns are exchanged with each other or with their inverse."""
     for one in find_axes(_moments(images), inside):
-        read = one.remedy.rsplit("(", 1)[1].rstrip(")").split(", ")
+        read = one.axes or AXIS_NAMES
         axes = sorted({axis for axis, term in zip(AXIS_NAMES, read, strict=True) if term != axis})
         names = [name for axis in axes for name in (axis, f"-{axis}")]
         yield Finding(

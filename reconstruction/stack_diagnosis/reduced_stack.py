@@ -16,11 +16,15 @@ MAX_SIDE_PX = 160
 
 @dataclass(frozen=True, slots=True)
 class ReducedStack:
-    """Reduced images (N, H, W), which samples are usable, and the object (H, W)."""
+    """Reduced images (N, H, W), which samples are usable, and the object (H, W).
+
+    A pixel is the mean of ``step`` x ``step`` pixels of the images.
+    """
 
     gray: Float64Array
     usable: BoolArray
     inside: BoolArray
+    step: int = 1
 
 
 def reduce_stack(
@@ -45,4 +49,4 @@ def reduce_stack(
         good[number] = blocks(kept).all(axis=(1, 3))
         unusable.append(1.0 - float(kept[inside].mean()) if inside.any() else 1.0)
     whole = np.asarray(blocks(inside).all(axis=(1, 3)))
-    return ReducedStack(means, good, whole), np.array(unusable)
+    return ReducedStack(means, good, whole, step), np.array(unusable)

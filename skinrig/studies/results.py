@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -194,10 +194,29 @@ def _group(
     return found
 
 
+def _average_people(judged: Sequence[JudgedCase]) -> list[JudgedQuantity]:
+    """Return one row per rig, subject and seed: repeats of one person are correlated."""
+    people = _group(judged, lambda case, row: (case.rig, case.subject, case.seed))
+    return [_average([row for _, row in own]) for own in people.values()]
+
+
+def _average(rows: Sequence[JudgedQuantity]) -> JudgedQuantity:
+    """Return one person's mean fractions inside; its truths are those of the largest case."""
+    return replace(
+        rows[0],
+        truths=max(row.truths for row in rows),
+        error=float(np.median([row.error for row in rows])),
+        width=float(np.median([row.width for row in rows])),
+        inside_68=float(np.mean([row.inside_68 for row in rows])),
+        inside_95=float(np.mean([row.inside_95 for row in rows])),
+    )
+
+
 def _pool(part: Part, confidence: float) -> dict[str, Any]:
-    """Return error and coverage over the cases of a part."""
+    """Return error and coverage over the cases of a part; a coverage is a mean over people."""
     rows = [row for _, row in part.judged]
-    covered = [pool_trials(rows, level=n, confidence=confidence) for n in COVERAGE_RANGES]
+    people = _average_people(part.judged)
+    covered = [pool_trials(people, level=n, confidence=confidence) for n in COVERAGE_RANGES]
     return {
         "quantity": part.quantity,
         "skin": part.skin,
@@ -205,7 +224,7 @@ def _pool(part: Part, confidence: float) -> dict[str, Any]:
         "cases": len(rows),
         "unit": rows[0].unit,
         "median_error": float(np.median([row.error for row in rows])),
-        "half_width": covered[0].width,
+        "half_width": float(np.median([row.width for row in rows])),
         "coverage": {
             str(one.level): {
                 "inside": one.inside_fraction,

@@ -99,9 +99,12 @@ class IntervalCoverage:
 
     @property
     def verdict(self) -> str:
-        """Verdict: "kept" (coverage in range), "open" (only its interval is) or "missed"."""
+        """Verdict: "kept" (coverage in range), "open" (only its interval is) or "missed".
+
+        One subject leaves the coverage open.
+        """
         low, high = COVERAGE_RANGES[self.level]
-        if low <= self.inside_fraction <= high:
+        if self.subjects > 1 and low <= self.inside_fraction <= high:
             return "kept"
         return "open" if self.interval[1] >= low and self.interval[0] <= high else "missed"
 

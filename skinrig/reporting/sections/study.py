@@ -42,9 +42,10 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         f"{document['cases']} cases, {len(failed) or 'none'} failed. {_count_verdicts(rows)}"
     )
     yield page.Paragraph(
-        "A coverage is the mean, over cases, of the fraction of ground truths inside the stated "
-        f"intervals. {_describe_ranges()} Verdicts: kept, the coverage is in its range; open, only "
-        "a part of its interval is, as cases are few; missed, the whole interval is outside. If "
+        "A coverage is the mean, over people, of the fraction of ground truths inside the stated "
+        f"intervals. {_describe_ranges()} Verdicts: kept, the coverage of two people or more is in "
+        "its range; open, only a part of its interval is, as people are few; missed, the whole "
+        "interval is outside. If "
         "all intervals are correct, any verdict is missed with a probability of "
         f"{100 * FALSE_ALARM_RATE:g} % at most. Numbers below the figures count cases."
     )

@@ -157,6 +157,27 @@ def test_a_broken_list_is_refused_by_name(rti, tmp_path, text, expected):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.parametrize("name", ["a.lp", "lights.txt"])
+@pytest.mark.parametrize(
+    "row",
+    [
+        "img{}.png, 0,5, 0,3, 0,8",
+        "img{}.png,0,5,0,3,0,8",
+        "img{}.png;0,5;0,3;0,8;1,0",
+        "img{}.png, 0.5, 0.3, 0.8, 1.0",
+        "img{}.png 0,5 0,3 0,8 1,0",
+        "img{}.png 0.5 0.3 0.8 1.0",
+        "img{}.png 5 0.3 0.8 1.0",
+    ],
+)
+def test_row_of_other_columns_is_refused(row, name, rti, tmp_path):
+    folder, _, _, _ = rti
+    (folder / "a.lp").unlink()
+    (folder / name).write_text("\n".join(row.format(k) for k in range(12)))
+    with pytest.raises(LightListError, match=r"name x y z|missing image"):
+        import_light_list(folder, out=tmp_path / "s")
+
+
 def test_invalid_light_list_input_is_refused_by_name(rti, tmp_path):
     folder, _, _, _ = rti
     with pytest.raises(LightListError, match="folder not found"):
@@ -219,3 +240,25 @@ def test_intensities_apply_to_lists_of_every_form(tmp_path):
     (tmp_path / "f" / "lights.json").write_text(json.dumps(lights.tolist()))
     found = light_lists.find_light_list(tmp_path / "f")
     np.testing.assert_array_equal(found.intensity, rows)
+
+
+@pytest.mark.parametrize("name", ["lights.txt", "a.lp", "lights.json"])
+def test_intensities_follow_rows_of_named_list(name, tmp_path):
+    lights = directions(6)
+    write(tmp_path / "f", sphere(lights)[0])
+    order = [3, 1, 0, 5, 4, 2]
+    names = [f"img{k}.png" for k in order]
+    if name == "lights.json":
+        listed = dict(zip(names, lights[order].tolist(), strict=True))
+        (tmp_path / "f" / name).write_text(json.dumps(listed))
+    else:
+        write_lp(tmp_path / "f" / name, names, lights[order])
+    rows = np.arange(1.0, 19.0).reshape(6, 3)
+    strengths = tmp_path / "f" / "light_intensities.txt"
+    np.savetxt(strengths, rows)
+    found = light_lists.find_light_list(tmp_path / "f")
+    assert [file.name for file in found.images] == names
+    np.testing.assert_array_equal(found.intensity, rows)
+    np.savetxt(strengths, rows[:5])
+    with pytest.raises(LightListError, match="does not fit the lights"):
+        light_lists.find_light_list(tmp_path / "f")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.importers.light_tables import LightListError, read_light_table
+from capture.importers.light_tables import LightListError, read_light_table, split_row
 
 VECTORS = [[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]
 
@@ -69,3 +69,19 @@ def test_archive_of_arrays_is_refused(tmp_path):
     (tmp_path / "a.npz").rename(tmp_path / "lights.npy")
     with pytest.raises(LightListError, match="not a NumPy array"):
         read_light_table(tmp_path / "lights.npy")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("D:\\RTI, bowl\\img1.png 0.1 0.2 0.97", ["D:\\RTI, bowl\\img1.png", "0.1", "0.2", "0.97"]),
+        ("img1.png, 0.1 0.2 0.97", ["img1.png", "0.1", "0.2", "0.97"]),
+        ("img1.png, 0.1, 0.2, 0.97", ["img1.png", "0.1", "0.2", "0.97"]),
+        ("img1.png,0.1,0.2,0.97", ["img1.png", "0.1", "0.2", "0.97"]),
+        ("img1.png\t0,1\t0,2\t0,97", ["img1.png", "0,1", "0,2", "0,97"]),
+        ("img 1.png; 0,1; 0,2; 0,97", ["img 1.png", "0,1", "0,2", "0,97"]),
+        ("img0.png, 0,5, 0,3, 0,8", ["img0.png", "0", "5", "0", "3", "0", "8"]),
+    ],
+)
+def test_row_is_split_where_its_numbers_are(line, words):
+    assert split_row(line) == words

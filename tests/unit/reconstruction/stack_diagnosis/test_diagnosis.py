@@ -1,7 +1,9 @@
 """Faults of images under listed lights are named with the right images; sound sets have none."""
 
 import csv
+import re
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from fixtures.faulty_stacks import FAULTS, GRADED, make
 from model.metrics import angular_error_rad
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals
-from reconstruction.stack_diagnosis import diagnose_stack, light_labels
+from reconstruction.stack_diagnosis import diagnose_stack, light_labels, moved_images
 from reconstruction.stack_diagnosis.shading_space import Agreement
 
 NAMED_ALONE = {"two swapped", "dim", "zeros", "dark", "half of zeros", "mirrored"}
@@ -104,6 +106,32 @@ def test_left_out_images_are_the_wrong_ones():
     for fault in ("zeros", "one wrong", "moved", "all lights on"):
         stack = make(fault, 300, side=64, count=12)
         assert tuple(np.flatnonzero(diagnose(stack).left_out)) == stack.frames
+
+
+def test_shift_is_stated_in_pixels_of_images():
+    """Images of twice the side have the same blocks, so that the shift is twice as large."""
+    stack = make("moved", 300, side=160, count=12)
+    large = replace(stack, images=stack.images.repeat(2, 1).repeat(2, 2),
+                    inside=stack.inside.repeat(2, 0).repeat(2, 1))  # fmt: skip
+    small, twice = (
+        next(x for x in diagnose(one).findings if x.fault == "moved image")
+        for one in (stack, large)
+    )
+    assert twice.frames == small.frames == stack.frames
+    assert twice.measured == pytest.approx(2.0 * small.measured, rel=1e-6)
+    assert twice.limit == pytest.approx(2.0 * small.limit)
+    shift = [float(x) for x in re.findall(r"-?\d+\.\d", twice.evidence)[:2]]
+    assert np.hypot(*shift) == pytest.approx(twice.measured, abs=0.1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_image_of_few_lit_samples_is_not_compared():
+    inside = np.ones((24, 24), bool)
+    image = np.where(np.arange(24 * 24).reshape(24, 24) < 50, 0.5, 0.0)
+    normals = np.broadcast_to([0.0, 0.0, 0.5], (24, 24, 3))
+    usable = np.ones((2, 24, 24), bool)
+    for images in (np.array([image, 0.0 * image]), -1.0 + 0.0 * np.array([image, image])):
+        assert not list(moved_images.find_moved(images, usable, inside, normals))
 
 
 def test_near_lists_are_not_judged_by_one_direction():

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import tifffile
 from fixtures import foreign_folders
 from fixtures.foreign_folders import HEIC_HEAD, READABLE, UNREADABLE, ball, jpeg, lights
+from PIL import Image
 
 from capture.importers import read_photo
 from capture.importers.light_lists import to_gray
@@ -95,6 +97,9 @@ def test_stranger_photographs_are_imported_or_refused(name, code, part, tmp_path
         ("me.jpg", HEIC_HEAD, "is a HEIC image"),
         ("me.webp", b"RIFF\0\0\0\0WEBPVP8 " + bytes(40), "is a WebP image"),
         ("clip.mov", b"\0\0\0\x14ftypqt  " + bytes(40), "ffmpeg -i VIDEO"),
+        ("me.jpg", b"RIFF\0\0\0\0WEBPVP8 " + bytes(40), "is a WebP image"),
+        ("clip.bin", b"RIFF\0\0\0\0AVI LIST" + bytes(40), "that is a video"),
+        ("sound.bin", b"RIFF\0\0\0\0WAVEfmt " + bytes(40), "is not a raw file"),
         ("Thumbs.db", b"\xd0\xcf\x11\xe0" + bytes(40), "is not a raw file"),
         ("me.jpg", jpeg(ball()[0], mode="CMYK"), "face"),
     ],
@@ -111,8 +116,9 @@ def test_photo_of_folder_states_what_to_do(tmp_path, capsys):
     assert "skinrig import photos" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_turns_image_upright(orientation, tmp_path):
+def test_exif_orientation_turns_image_upright(orientation, suffix, tmp_path):
     """Exif 2.32, tag 0x0112: stored row 0 and column 0 are these sides of the upright image."""
     upright = ball(64, 48)[2]
     stored = {
@@ -125,9 +131,19 @@ def test_exif_orientation_turns_image_upright(orientation, tmp_path):
         7: upright[::-1, ::-1].transpose(1, 0, 2),
         8: np.rot90(upright, -1),
     }[orientation]
-    file = tmp_path / "a.jpg"
-    file.write_bytes(jpeg(np.ascontiguousarray(stored), orientation=orientation))
+    file = tmp_path / f"a.{suffix}"
+    pixels = np.ascontiguousarray(stored)
+    if suffix == "jpg":
+        file.write_bytes(jpeg(pixels, orientation=orientation))
+    elif suffix == "png":
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.fromarray(pixels).save(file, exif=exif)
+    else:
+        tag = (0x0112, "H", 1, orientation, True)
+        tifffile.imwrite(file, pixels, extratags=[tag], photometric="rgb")
     photo = read_photo(file)
+    assert any("EXIF orientation" in note for note in photo.notes) == (orientation != 1)
     gray = to_gray(photo.frame)
     assert (photo.orientation, gray.shape) == (orientation, (48, 64))
     assert np.corrcoef(np.sqrt(gray).ravel(), upright.mean(axis=-1).ravel())[0, 1] > MIN_CORRELATION

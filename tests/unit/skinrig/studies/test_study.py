@@ -4,6 +4,7 @@ import csv
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from fixtures.study_judge import FAILING_SUBJECT, judge_by_drawing
 
@@ -12,8 +13,9 @@ from skinrig.console import Console
 from skinrig.errors import MissingExtra, UnusableError
 from skinrig.simulating.orders import order_for
 from skinrig.studies import description, executors
-from skinrig.studies.cases import CaseOrder, run_case
+from skinrig.studies.cases import CaseOrder, JudgedQuantity, run_case
 from skinrig.studies.description import CaseGroup, StudyError, StudyFile, read_study, software_hash
+from skinrig.studies.results import summarize
 from skinrig.studies.study import run_study
 
 TEXT = """
@@ -272,6 +274,29 @@ def test_coverage_is_divided_by_type_age_and_iso(tmp_path):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "30 days" in page
     assert "ISO x 4" in page
+
+
+def test_repeated_people_count_once_in_bounds():
+    """12 people under 6 conditions that agree determine no more than 12 people under one."""
+    groups = (group(seeds="0..11", calibration_age_days=(0, 30, 60), iso_factors=(1.0, 4.0)),)
+    repeated = {case.name: case for case in study_of(*groups).list_cases()}
+    once = {case.name: case for case in study_of(group(seeds="0..11")).list_cases()}
+    inside = np.random.default_rng(0).uniform(0.3, 0.9, 12)
+
+    def bounds(cases):
+        rows = {
+            name: [JudgedQuantity("x", case.skin, 400, 1.0, 1.0, "%", inside[case.seed], 0.95)]
+            for name, case in cases.items()
+        }
+        return summarize("Some cases", cases, rows, {})["quantities"][0]
+
+    many, few = bounds(repeated), bounds(once)
+    assert (many["cases"], few["cases"]) == (72, 12)
+    for level in ("68", "95"):
+        wide, narrow = (one["coverage"][level] for one in (many, few))
+        assert wide["inside"] == pytest.approx(narrow["inside"])
+        # more parts share the rate of false alarms, so that bounds are wider
+        assert wide["high"] - wide["low"] >= narrow["high"] - narrow["low"]
 
 
 @pytest.mark.parametrize("rig", ["flash", "dome", "gradient", "probe"])

@@ -50,8 +50,11 @@ def test_correlated_pixel_errors_widen_coverage_like_subjects(rng):
     assert high - low > 0.05
 
 
-def test_single_subject_gives_no_interval(rng):
-    assert pool_trials(trials_of(rng, shared=0.0, subjects=1), level=68).interval == (0.0, 1.0)
+def test_single_subject_gives_no_interval_and_stays_open(rng):
+    found = pool_trials(trials_of(rng, shared=0.0, subjects=1), level=68)
+    assert found.interval == (0.0, 1.0)
+    assert found.inside_fraction == pytest.approx(0.68, abs=0.05)
+    assert found.verdict == "open"
 
 
 def test_bands_are_reported_and_subjects_without_truth_omitted(rng):
