@@ -84,7 +84,7 @@ def forecast_resources(work: str, amounts: Amounts) -> ResourceForecast:
     Examples
     --------
     >>> forecast_resources("reconstruct flash", {"camera_mp": 1.0}).memory_mb
-    475.0
+    563.0
     """
     row: Mapping[str, Any] = _read_table()
     for word in work.split():

@@ -103,6 +103,7 @@ def test_stranger_photographs_are_imported_or_refused(name, code, part, tmp_path
         ("Thumbs.db", b"\xd0\xcf\x11\xe0" + bytes(40), "is not a raw file"),
         ("me.jpg", jpeg(ball()[0], mode="CMYK"), "face"),
     ],
+    ids=["heic", "heic as jpg", "webp", "mov", "webp as jpg", "avi", "wav", "thumbs", "no face"],
 )
 def test_photo_of_other_format_states_what_to_do(name, data, part, tmp_path, capsys):
     (tmp_path / name).write_bytes(data)
