@@ -9,6 +9,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -260,9 +261,9 @@ class FaultyDisk(LoggedDisk):
         """Log a sync of the names in a directory."""
         self._run("fsync_dir", super().fsync_dir, path)
 
-    def lock(self, descriptor: int) -> bool:
-        """Acquire the writer's lock."""
-        return bool(self._run("lock", super().lock, descriptor))
+    def lock(self, descriptor: int, *, shared: bool = False) -> bool:
+        """Acquire the writer's lock, or one that excludes writers only."""
+        return bool(self._run("lock", partial(super().lock, shared=shared), descriptor))
 
 
 @dataclass
