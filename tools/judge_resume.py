@@ -17,30 +17,25 @@ import argparse
 import hashlib
 import itertools
 import json
-import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from multiprocessing.context import ForkProcess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-# imported before processes are forked, which spares each the seconds of the imports
-import skinrig.simulating.dome
-import skinrig.simulating.flash
-import skinrig.simulating.gradient
-import skinrig.simulating.probe  # noqa: F401
 from rigsim.world import World
 from skinrig.cli import main as main_command
 
-FORK = multiprocessing.get_context("fork")
+RUN_WORD = "--run"
+"""First argument of a process that runs one command."""
 MAX_KILLS_PER_CHAIN = 8
 """Kills until a command may end: on a machine that became busier it might never."""
 DATE_EPOCH_S = 1_795_000_000
@@ -130,8 +125,8 @@ def list_outputs(out: Path) -> list[Path]:
 def hash_outputs(out: Path) -> dict[str, str]:
     """Hash the files of an output folder, and those of a session's ground truth."""
     return {
-        f"{folder.name}/{name}": digest
-        for folder in list_outputs(out)
+        f"{number}/{name}": digest
+        for number, folder in enumerate(list_outputs(out))
         for name, digest in hash_folder(folder).items()
     }
 
@@ -142,20 +137,17 @@ def remove_outputs(out: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def start(arguments: Sequence[str], log: Path) -> ForkProcess:
-    """Start skinrig with --json in a child of this process; its events go to a file."""
-    process = FORK.Process(target=run_command, args=(arguments, log))
-    process.start()
-    return process
+def start(arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
+    """Start skinrig with --json; its events go to a file, its computed exposures to another."""
+    words = [sys.executable, __file__, RUN_WORD, str(log), *arguments]
+    with open(log, "wb") as stream:
+        return subprocess.Popen(
+            words, stdout=subprocess.DEVNULL, stderr=stream, start_new_session=True
+        )
 
 
-def run_command(arguments: Sequence[str], log: Path) -> None:
-    """Run skinrig with its streams in a file, and log each computed exposure."""
-    os.setsid()
-    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(descriptor, 2)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    sys.stderr = os.fdopen(2, "w", buffering=1)
+def run_command(arguments: Sequence[str], log: Path) -> int:
+    """Run skinrig, and log each computed exposure; return its exit code."""
     computed, expose = log.with_suffix(".computed"), World.expose
 
     def count(self: World, view: str, *given: Any, seed: int, **light: Any) -> Any:
@@ -164,7 +156,7 @@ def run_command(arguments: Sequence[str], log: Path) -> None:
         return expose(self, view, *given, seed=seed, **light)
 
     setattr(World, "expose", count)  # noqa: B010
-    os._exit(main_command([*arguments, "--json"]))
+    return main_command([*arguments, "--json"])
 
 
 def read_computed(log: Path) -> list[str]:
@@ -235,14 +227,13 @@ def kill_until_done(
         log.unlink(missing_ok=True)
         begun = (out / "session.json").exists() or not again
         process = start([*run, *(again if begun else ())], log)
-        while process.is_alive() and not read_events(log):
+        while process.poll() is None and not read_events(log):
             time.sleep(0.02)
-        process.join(after_s if len(kills) < most else None)
-        if process.is_alive():
-            os.killpg(process.pid or 0, signal.SIGKILL)
-            process.join()
-        else:
-            code = process.exitcode
+        try:
+            code = process.wait(timeout=after_s if len(kills) < most else None)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         kills.append((after_s, read_events(log)))
     found = hash_outputs(out)
     same = code == 0 and found == expected and not list(out.parent.glob(f".{out.name}.*"))
@@ -294,8 +285,7 @@ def judge(
         run, again = runs[name]
         for _ in () if name in undisturbed else ("compile", "judge")[compiled:]:
             process = start([*run, "--out", str(out)], log)
-            process.join()
-            if process.exitcode != 0:
+            if process.wait() != 0:
                 raise SystemExit(log.read_text())
             events = read_events(log)
             undisturbed[name] = events[-1][1] - events[0][1], hash_outputs(out)
@@ -349,4 +339,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == [RUN_WORD]:
+        sys.exit(run_command(sys.argv[3:], Path(sys.argv[2])))
     sys.exit(main())

@@ -274,7 +274,8 @@ class Checkpoints:
         start = time.perf_counter()
         try:
             size = estimate_bytes(value)
-            rate = self._stored_bytes / self._spent_s if self._spent_s > 0.1 else BYTES_PER_S
+            known = self._stored_bytes > 0 and self._spent_s > 0.1
+            rate = self._stored_bytes / self._spent_s if known else BYTES_PER_S
             cost = self._spent_s + FILE_S + size / rate
             # a record is a few bytes, without which nothing of the stage is taken up
             if kind == "record" or cost <= self.max_cost * (start - self._started_s):

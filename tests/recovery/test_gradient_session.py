@@ -126,10 +126,13 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
     cut, whole = (store.read(path).parameters["states"] for path in (again.truth, made.truth))
     assert cut == whole  # the run is replayed: skin is not taped again
     tapings = {
-        path: {strain_state(r.step): r.actual["attachment"] for r in frames("gradient")}
-        for path, frames in ((out, session.frames), (made, Session.open(made.session).frames))
+        str(path): [(strain_state(r.step), r.actual["attachment"]) for r in frames("gradient")]
+        for path, frames in (
+            (out, session.frames),
+            (made.session, Session.open(made.session).frames),
+        )
     }
-    assert tapings[out] == tapings[made]
+    assert tapings[str(out)] == tapings[str(made.session)]
 
 
 def test_truth_with_lost_log_is_not_invented(made, tmp_path):

@@ -130,12 +130,12 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
     from skinrig.fitting.facial_color import fit_facial_color
     from skinrig.simulating.simulation import simulate_session
 
-    create = Session.create
+    create = Session.create.__func__
     narrow = SubjectRecord("P042", ("research",), date(2030, 1, 1))
     monkeypatch.setattr(
         Session,
         "create",
-        lambda *a, **k: create(*a, **{**k, "source": "measured", "subject": narrow}),
+        classmethod(lambda *a, **k: create(*a, **{**k, "source": "measured", "subject": narrow})),
     )
     simulate_session(
         "flash",
