@@ -269,7 +269,7 @@ def test_json_error_is_single_document(argv, exit_code, says, code, capsys, tmp_
 
 
 def test_interrupted_command_is_reported(monkeypatch, capsys):
-    def interrupted(path):
+    def interrupted(path, **_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("capture.session.verify", interrupted)
