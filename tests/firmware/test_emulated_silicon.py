@@ -27,6 +27,7 @@ LIT_S = 0.4
 """Least time for which `LIT` lights, s."""
 HOLD_S = 0.25
 """Time in which the head is held, s."""
+HOLD_PARTS = 5
 CYCLES_SLACK_S = 2e-3
 DARK_SLACK_S = 0.010
 JUDGED_ROWS = 480
@@ -95,7 +96,9 @@ def dark(request):
             for text in texts:
                 port.ask(text)
                 if text.startswith("PUMP"):
-                    port.listen(HOLD_S)
+                    for _ in range(HOLD_PARTS):  # each question renews the lease
+                        port.listen(HOLD_S / HOLD_PARTS)
+                        port.ask("STAT?")
             target.wait_for(lambda: rises(target, pin_name(board, pin)))
 
         yield target, port, pin_name(board, pin), light
