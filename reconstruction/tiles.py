@@ -7,13 +7,17 @@ The only interface for parallel and distributed work: any executor with ``submit
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import TypeVar
+from contextlib import contextmanager
+from typing import Final, TypeVar
 
-from numba import get_num_threads
+from numba import get_num_threads, set_num_threads, threading_layer
+from threadpoolctl import threadpool_limits
 
 from model.checks import Checks
 
 MAX_THREADS = 8
+MAX_WORKERS: Final = 4
+"""Tiles of a stage that are computed at once; each needs the memory of its samples."""
 
 Tile = TypeVar("Tile")
 Result = TypeVar("Result")
@@ -90,3 +94,48 @@ def map_on_threads(
         return list(map_tiles(fn, tiles, executor=executor))
     with ThreadPoolExecutor(min(get_num_threads(), MAX_THREADS)) as pool:
         return list(map_tiles(fn, tiles, executor=pool, window=window))
+
+
+@contextmanager
+def open_worker_pool(workers: int = MAX_WORKERS) -> Iterator[tuple[Executor | None, int]]:
+    """Open threads for independent tiles that each use all of NumPy and Numba.
+
+    Numba's threads are divided among the workers, and BLAS has one, so that a tile's bytes do not
+    depend on the number of workers. Where parallel kernels must not be called from several threads
+    (Numba's own thread pool), or have not been called yet, there is one worker.
+
+    Parameters
+    ----------
+    workers
+        Most threads; at most Numba's number of threads is used.
+
+    Yields
+    ------
+    executor
+        For :func:`map_tiles`; None for one worker, which is the calling thread.
+    workers
+        Number of tiles that are computed at once, >= 1.
+
+    Examples
+    --------
+    >>> with open_worker_pool(1) as (executor, workers):
+    ...     list(map_tiles(abs, [-1, 2, -3], executor=executor, window=workers))
+    [1, 2, 3]
+    """
+    threads = get_num_threads()
+    count = min(workers, threads) if _has_safe_threads() else 1
+    with threadpool_limits(1, user_api="blas"):
+        if count < 2:
+            yield None, 1
+            return
+        own = (threads // count,)
+        with ThreadPoolExecutor(count, initializer=set_num_threads, initargs=own) as pool:
+            yield pool, count
+
+
+def _has_safe_threads() -> bool:
+    """Return whether several threads may call parallel kernels at once."""
+    try:
+        return threading_layer() in ("omp", "tbb")
+    except ValueError:  # not chosen before the first parallel kernel
+        return False

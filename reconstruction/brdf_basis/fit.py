@@ -26,9 +26,9 @@ from sklearn.exceptions import ConvergenceWarning
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.brdf_basis.nnls_kernels import fit_points
-from reconstruction.lumitexels import boundary_kernels
+from reconstruction.lumitexels import sample_kernels
 
 MIN_SAMPLE_COSINE = 0.1
 """Least cosine of light and view of a used sample."""
@@ -148,32 +148,33 @@ def surface_samples(
     albedo = np.asarray(r_d, dtype=np.float64)
     Checks(SampleError).shape("normals", n, (points, 3))
     Checks(SampleError).shape("r_d", albedo, (points, channels))
-    cos_l = np.einsum("pmc,pc->pm", light, n)
-    cos_v = np.einsum("pmc,pc->pm", view, n)
-    through = boundary_kernels.boundary_transmittance(
-        np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta
+    usable = np.ones(f.shape[:2], bool) if valid is None else np.asarray(valid, dtype=bool)
+    unknown = np.empty((points, samples, 0), np.float32)
+    made = (
+        np.empty((points, samples), np.float32),
+        np.empty((points, samples), np.float32),
+        np.empty((points, samples), bool),
     )
-    surface = f - (through[..., None] * albedo[:, None] / np.pi)
-    usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= MIN_SAMPLE_COSINE)
-    usable &= cos_v >= MIN_SAMPLE_COSINE
-    if valid is not None:
-        usable &= np.asarray(valid, dtype=bool)
-    if variance is None:
-        value, spread = surface.mean(axis=-1), np.zeros((points, samples))
-    else:
-        var = np.asarray(variance, dtype=np.float64)
-        usable &= np.all((var > 0.0) & np.isfinite(var), axis=-1)
-        weight = 1.0 / np.where(usable[..., None], var, 1.0)
-        spread = 1.0 / weight.sum(axis=-1)
-        value = np.sum(weight * surface, axis=-1) * spread
-    return SurfaceSamples(
-        np.where(usable, value * cos_l, 0.0).astype(np.float32),
-        np.where(usable, spread * cos_l**2, 1.0).astype(np.float32),
-        light,
-        view,
-        n,
-        usable,
+    sample_kernels.subtract_diffuse(
+        np.ascontiguousarray(f),
+        unknown if variance is None else _broadcast_variance(variance, f.shape),
+        (np.ascontiguousarray(light), np.ascontiguousarray(view)),
+        np.ascontiguousarray(n, np.float64),
+        np.ascontiguousarray(albedo),
+        np.ascontiguousarray(np.broadcast_to(usable, (points, samples))),
+        float(eta),
+        MIN_SAMPLE_COSINE,
+        made,
     )
+    value, spread, used = made
+    return SurfaceSamples(value, spread, light, view, n, used)
+
+
+def _broadcast_variance(variance: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return variances of one dtype and layout, as the kernel needs them."""
+    given = np.asarray(variance)
+    wide = given if given.dtype == np.float32 else given.astype(np.float64, copy=False)
+    return np.ascontiguousarray(np.broadcast_to(wide, shape))
 
 
 def fit_weights(

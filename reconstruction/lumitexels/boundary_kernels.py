@@ -54,9 +54,10 @@ def boundary_transmittance(
 
 
 @njit(inline="always")
-def _reflectance(cosine, eta):  # type: ignore[no-untyped-def]
+def boundary_reflectance(cosine, eta):  # type: ignore[no-untyped-def]
+    """Return the reflectance of a smooth boundary for unpolarized light; NaN for NaN."""
     # Fresnel: r_s = (mu_i - eta mu_t) / (mu_i + eta mu_t), r_p = (eta mu_i - mu_t) / (eta mu_i +
-    # mu_t), R = (r_s^2 + r_p^2) / 2 for unpolarized light; NaN passes both comparisons unchanged
+    # mu_t), R = (r_s^2 + r_p^2) / 2; NaN passes both comparisons unchanged
     mu_i = 0.0 if cosine < 0.0 else (1.0 if cosine > 1.0 else cosine)
     sin2_t = (1.0 - mu_i * mu_i) / eta / eta
     if sin2_t >= 1.0:
@@ -72,5 +73,5 @@ def _reflectance(cosine, eta):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True, error_model="numpy")
 def _transmitted(cos_light, cos_view, eta, out):  # type: ignore[no-untyped-def]
     for k in range(out.size):
-        inside = 1.0 - _reflectance(np.float64(cos_light[k]), eta)
-        out[k] = inside * (1.0 - _reflectance(np.float64(cos_view[k]), eta))
+        inside = 1.0 - boundary_reflectance(np.float64(cos_light[k]), eta)
+        out[k] = inside * (1.0 - boundary_reflectance(np.float64(cos_view[k]), eta))

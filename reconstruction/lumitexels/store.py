@@ -193,7 +193,8 @@ class LumitexelStore:
         if part in self._kept:
             return self._kept[part]
         found = self._chunk(start, stop)
-        samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
+        # several threads read chunks at once: the list is made in one step
+        samples = sum(kept.valid.size for kept in [found, *list(self._kept.values())])
         if BYTES_PER_SAMPLE * samples <= self._kept_bytes:
             self._kept[part] = found
         return found

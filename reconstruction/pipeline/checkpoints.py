@@ -34,6 +34,7 @@ from reconstruction.pipeline.product_file import (
     read_product,
     write_product,
 )
+from reconstruction.tiles import map_tiles, open_worker_pool
 
 Result = TypeVar("Result")
 
@@ -356,6 +357,8 @@ def compute_tiles(
     tiles: Sequence[Any],
     compute: Callable[[Any], Result],
     report: Callable[[str, int, int], None],
+    *,
+    workers: int = 1,
 ) -> Iterator[Result]:
     """Yield the result of each tile in order, taken from the checkpoints where it is stored.
 
@@ -372,15 +375,26 @@ def compute_tiles(
     report
         Called before each tile that is computed with ``stage``, the number of earlier tiles and
         that of all.
+    workers
+        Most tiles that are computed at once, on threads.
     """
-    for number, tile in enumerate(tiles):
-        name = f"{stage} {number} of {len(tiles)}"
-        found = None if checkpoints is None else checkpoints.load_tile(name)
-        if found is not None:
-            yield found[0]
-            continue
-        report(stage, number, len(tiles))
-        made = compute(tile)
-        if checkpoints is not None:
-            checkpoints.store_tile(name, made)
-        yield made
+
+    def begin() -> Iterator[tuple[int, tuple[Result] | None]]:
+        for number in range(len(tiles)):
+            found = None if checkpoints is None else checkpoints.load_tile(name(number))
+            if found is None:
+                report(stage, number, len(tiles))
+            yield number, found
+
+    def finish(begun: tuple[int, tuple[Result] | None]) -> tuple[int, bool, Result]:
+        number, found = begun
+        return number, found is None, compute(tiles[number]) if found is None else found[0]
+
+    def name(number: int) -> str:
+        return f"{stage} {number} of {len(tiles)}"
+
+    with open_worker_pool(workers) as (executor, count):
+        for number, fresh, made in map_tiles(finish, begin(), executor=executor, window=count):
+            if fresh and checkpoints is not None:
+                checkpoints.store_tile(name(number), made)
+            yield made

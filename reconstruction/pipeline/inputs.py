@@ -93,7 +93,12 @@ class Inputs:
     checkpoints: Checkpoints | None = None
 
     def compute_tiles(
-        self, stage: str, tiles: Sequence[Tile], compute: Callable[[Tile], Result]
+        self,
+        stage: str,
+        tiles: Sequence[Tile],
+        compute: Callable[[Tile], Result],
+        *,
+        workers: int = 1,
     ) -> Iterator[Result]:
         """Yield the result of each tile in order, report progress, and store the results.
 
@@ -105,9 +110,11 @@ class Inputs:
             Arguments of ``compute``.
         compute
             Without effect but its result, which depends on nothing but the stage's inputs.
+        workers
+            Most tiles that are computed at once, on threads.
         """
         report = self.progress.begin_tile
-        return compute_tiles(self.checkpoints, stage, tiles, compute, report)
+        return compute_tiles(self.checkpoints, stage, tiles, compute, report, workers=workers)
 
     def compute_part(self, name: str, compute: Callable[[], Result]) -> Result:
         """Return the result of one part of a stage, see `compute_tiles`."""

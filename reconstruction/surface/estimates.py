@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from model import fresnel
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo, photometric_stereo
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
-from reconstruction.lumitexels import Lumitexels, boundary_kernels
+from reconstruction.lumitexels import Lumitexels, sample_kernels
 from reconstruction.photometric_stereo import half_vectors as half_vector_normals
 from reconstruction.surface import model_normals
 from reconstruction.surface.model_normals import (
@@ -118,32 +118,20 @@ def normals_from_shading(
     Subsurface-scattered light has f_r = R_d F_t F_t / pi, so f_r cos(theta) pi / (F_t F_t) is R_d
     times n . l, linear in n.
     """
-    gray = samples.f.mean(axis=-1).astype(np.float64)
-    # invalid samples have infinite variance
-    spread = np.where(samples.valid, samples.variance.mean(axis=-1), 0.0).astype(np.float64) / 3.0
-    half = samples.light_dir + samples.view_dir
-    half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
     light_dir = np.ascontiguousarray(samples.light_dir.transpose(1, 0, 2))
-    start = np.asarray(normals, np.float64)
+    start = np.ascontiguousarray(normals, np.float64)
     good = has_enough_samples(samples)
     stderr = np.full(len(start), np.pi)
+    limits = MIN_NORMAL_COS_LIGHT, MIN_NORMAL_COS_VIEW, float(np.cos(highlight_rad))
+    given = "f variance light_dir view_dir cos_light valid"
+    shape = samples.valid.shape[::-1]
+    signal, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    used = np.empty(shape, np.bool_)
     for _ in range(rounds):
-        cos_light = np.einsum("pmk,pk->pm", samples.light_dir, start)
-        cos_view = np.einsum("pmk,pk->pm", samples.view_dir, start)
-        use = (
-            samples.valid
-            & (cos_light > MIN_NORMAL_COS_LIGHT)
-            & (cos_view > MIN_NORMAL_COS_VIEW)
-            & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
-        )
-        # f was computed from the radiance with the scan's cosine, not that of this round
-        passed = boundary_kernels.boundary_transmittance(cos_light, cos_view)
-        scale = np.pi * samples.cos_light / np.maximum(passed, 1e-3)
+        out = signal, variance, used
+        sample_kernels.shade(_arrays(samples, given), start, limits, fresnel.ETA_SKIN, out)
         found = photometric_stereo.estimate_normals(
-            np.where(use, gray * scale, 0.0).T.astype(np.float32),
-            light_dir,
-            variance=np.where(use, spread * scale**2, 1.0).T.astype(np.float32),
-            valid=np.ascontiguousarray(use.T),
+            signal, light_dir, variance=variance, valid=used
         )
         start = np.where(found.valid[:, None], found.normals, start).astype(np.float64)
         # the angle's error; in each of two tangential directions it is smaller by sqrt(2)
@@ -171,21 +159,22 @@ def reproject_samples(samples: Lumitexels, normals: PointValues) -> Lumitexels:
         Of the same points; samples of invalid normals, and of light below `GRAZING_COS`, become
         invalid.
     """
-    cos_light, cos_view = (
-        np.einsum("pmk,pk->pm", way, normals.values.astype(np.float32))
-        for way in (samples.light_dir, samples.view_dir)
+    given = "f variance light_dir view_dir cos_light cos_view valid"
+    names = "f", "variance", "cos_light", "cos_view", "valid"
+    made = {name: np.empty_like(getattr(samples, name)) for name in names}
+    sample_kernels.reproject(
+        _arrays(samples, given),
+        np.ascontiguousarray(normals.values, np.float64),
+        normals.valid,
+        GRAZING_COS,
+        tuple(made.values()),
     )
-    good = samples.valid & normals.valid[:, None] & (cos_light > GRAZING_COS)
-    ratio = np.where(good, samples.cos_light / np.maximum(cos_light, GRAZING_COS), 0.0)[..., None]
-    return dataclasses.replace(
-        samples,
-        f=samples.f * ratio,
-        variance=np.where(good[..., None], samples.variance, np.inf)
-        * np.where(good[..., None], np.square(ratio), 1.0),
-        cos_light=np.where(good, cos_light, samples.cos_light),
-        cos_view=np.where(good, cos_view, samples.cos_view),
-        valid=good,
-    )
+    return dataclasses.replace(samples, **made)
+
+
+def _arrays(samples: Lumitexels, names: str) -> tuple[NDArray[Any], ...]:
+    """Return fields of samples for a kernel."""
+    return tuple(np.ascontiguousarray(getattr(samples, name)) for name in names.split())
 
 
 def estimate_albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:

@@ -25,6 +25,7 @@ from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.model_normals import PointLobes
 from reconstruction.surface.texture import SurfaceTexture
+from reconstruction.tiles import MAX_WORKERS
 
 BASIS_RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
@@ -35,7 +36,7 @@ MAX_RELATIVE_STRENGTH: Final = 6.0
 RECORDED_RANKS: Final = (1, 2, BASIS_RANK, 2 * BASIS_RANK, 24)
 """Ranks whose mixtures and errors are recorded, up to the rank that the points support."""
 
-CHUNK_SAMPLES: Final = 3_000_000
+CHUNK_SAMPLES: Final = 1_500_000
 """Samples per chunk; about 60 bytes each."""
 
 BASIS_POINTS: Final = 5_000
@@ -96,7 +97,7 @@ class SurfaceSampleStore:
             samples = self.samples(part)
             return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
 
-        parts = list(self.compute_tiles(stage, self.parts(), of_part))
+        parts = list(self.compute_tiles(stage, self.parts(), of_part, workers=MAX_WORKERS))
         arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
         return PointValues(*map(np.concatenate, arrays))
 
@@ -129,7 +130,9 @@ def fit_lobes(
         return brdf_basis.fit_weights(shine, materials).weights
 
     parts = [part for part in lumitexels.parts() if len(drawn_in(part))]
-    fitted = list(lumitexels.compute_tiles("mixtures of materials", parts, fit_drawn))
+    fitted = list(
+        lumitexels.compute_tiles("mixtures of materials", parts, fit_drawn, workers=MAX_WORKERS)
+    )
     shares = _normalize_mixtures(
         np.concatenate(fitted), materials, min_points=max(rank, 2 * BASIS_RANK)
     )

@@ -47,8 +47,9 @@ from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
+from reconstruction.tiles import MAX_WORKERS
 
-STAGE_REVISION = 7
+STAGE_REVISION = 8
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"
@@ -269,7 +270,8 @@ def sample_surface(
         return store.view_samples(view)
 
     views = range(len(dome.cameras))
-    for view, samples in enumerate(dome.compute_tiles("lumitexels", views, sample)):
+    sampled = dome.compute_tiles("lumitexels", views, sample, workers=MAX_WORKERS)
+    for view, samples in enumerate(sampled):
         store.put_view(view, samples)
     return SurfaceSampleStore(store, keeper, len(dome.table.names), dome.compute_tiles)
 

@@ -1,8 +1,11 @@
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import pytest
 
-from reconstruction.tiles import map_tiles
+from reconstruction import tiles as module
+from reconstruction.tiles import map_tiles, open_worker_pool
 
 
 @pytest.mark.parametrize("threads", [0, 2])
@@ -37,3 +40,40 @@ def test_error_in_a_tile_is_propagated():
 def test_a_window_of_zero_is_refused():
     with pytest.raises(ValueError, match="window"):
         list(map_tiles(abs, [1], window=0))
+
+
+@numba.njit(parallel=True)
+def count_on_threads(n):
+    total = 0
+    for _ in numba.prange(n):
+        total += 1
+    return total
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one processor")
+def test_workers_divide_threads_and_run_parallel_kernels_together():
+    count_on_threads(3)  # starts the threads
+    met = threading.Barrier(2, timeout=20)
+    most = numba.get_num_threads()
+
+    def measure(n):
+        met.wait()  # fails unless two tiles run at once
+        return count_on_threads(n), numba.get_num_threads()
+
+    with open_worker_pool(2) as (executor, workers):
+        assert workers == 2
+        found = list(map_tiles(measure, [10**5] * 6, executor=executor, window=workers))
+    assert found == [(10**5, most // 2)] * 6
+    assert numba.get_num_threads() == most
+
+
+@pytest.mark.parametrize("layer", ["workqueue", ValueError("not chosen yet")])
+def test_kernels_of_unsafe_threads_get_one_worker(monkeypatch, layer):
+    def chosen():
+        if isinstance(layer, ValueError):
+            raise layer
+        return layer
+
+    monkeypatch.setattr(module, "threading_layer", chosen)
+    with open_worker_pool() as (executor, workers):
+        assert (executor, workers) == (None, 1)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction import tiles
 from reconstruction.pipeline import checkpoints as module
 from reconstruction.pipeline.checkpoints import BusyError, Checkpoints, RunRecord, compute_tiles
 from reconstruction.pipeline.graph import PipelineStage, run_stages
@@ -34,6 +35,7 @@ class Run:
     computed: list = field(default_factory=list)
     record: RunRecord = field(default_factory=lambda: RunRecord(["given"], {}, {}))
     kept: Checkpoints | None = None
+    workers: int = 1
 
     def compute(self, name):
         if name == self.stop_at:
@@ -50,8 +52,8 @@ class Run:
             self.compute(f"tile {number}")
             return self.options["gain"] * image.value[number]
 
-        tiles = compute_tiles(self.kept, "fit", range(N_TILES), fit_tile, lambda *_: None)
-        found = np.array(list(tiles))
+        given = range(N_TILES), fit_tile, lambda *_: None
+        found = np.array(list(compute_tiles(self.kept, "fit", *given, workers=self.workers)))
         self.record.noted["mean"] = float(found.mean())
         self.record.hashes["scan"] = "abc"
         return {"fitted": found, "count": len(found)}
@@ -95,6 +97,20 @@ def test_run_interrupted_anywhere_resumes_to_same_result(tmp_path, at):
     repeated = set(first.computed) & set(again.computed)
     # frames are unstorable, thus computed again where a later stage needs them
     assert repeated == ({"frames"} if at.startswith("tile") else set())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("at", EVERYTHING)
+def test_interrupted_threads_repeat_at_most_one_tile_each(tmp_path, at, monkeypatch):
+    monkeypatch.setattr(tiles, "_has_safe_threads", lambda: True)
+    monkeypatch.setattr(tiles, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(tiles, "set_num_threads", lambda _: None)
+    expected = Run(tmp_path / "whole").run()
+    first = interrupt(tmp_path / "out", at, workers=2)
+    again = Run(tmp_path / "out", workers=2)
+    assert again.run() == expected
+    repeated = set(first.computed) & set(again.computed) - {"frames"}
+    assert len(repeated) <= 1  # the other worker's is the interrupted one
     assert list(tmp_path.iterdir()) == []
 
 
