@@ -192,7 +192,6 @@ def fit_envelope(  # type: ignore[no-untyped-def]
         b = np.empty(n)
         low = np.empty((n, n))
         free = np.empty(n, dtype=np.int64)
-        wide = np.empty(_N_LOBES)
         scale2 = np.ones(channels)  # of the given variances
         seen = np.zeros(channels, dtype=np.int64)
         for i in range(samples):
@@ -234,6 +233,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                 shine = 0.0
                 for k in range(_N_LOBES):
                     shine += x[channels + k] * lobe[i, k]
+                weight = 0.0  # of all channels, which share the lobes
                 for c in range(channels):
                     if not valid[point, i, c]:
                         continue
@@ -253,12 +253,15 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                     t = through[i]
                     h[c, c] += w * t * t
                     rhs[c] += w * t * f[point, i, c]
+                    weight += w
                     for k in range(_N_LOBES):
-                        wide[k] = w * lobe[i, k]
-                        h[channels + k, c] += wide[k] * t
-                        rhs[channels + k] += wide[k] * f[point, i, c]
+                        wide = w * lobe[i, k]
+                        h[channels + k, c] += wide * t
+                        rhs[channels + k] += wide * f[point, i, c]
+                if weight > 0.0:
+                    for k in range(_N_LOBES):
                         for j in range(k + 1):
-                            h[channels + k, channels + j] += wide[k] * lobe[i, j]
+                            h[channels + k, channels + j] += weight * lobe[i, k] * lobe[i, j]
             for i in range(n):
                 for j in range(i):
                     h[j, i] = h[i, j]
