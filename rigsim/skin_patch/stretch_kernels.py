@@ -5,6 +5,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+LEAST_LOG_AREA = 0.05
+"""Projected area, over that of the affine state, below which -log J continues as a parabola."""
+
 # Energies are sums over nodes; the caller divides by their number. Rows grow with y. Every square
 # of four nodes is covered by its four corner triangles with weight one quarter each (flat finite
 # elements over both diagonals): so no mode of the grid has zero energy.
@@ -35,6 +38,16 @@ def _corner(a1, a2, a3, b1, b2, b3, p, q):  # type: ignore[no-untyped-def]
     return energy, caa, cab, cbb
 
 
+@njit(cache=True)
+def _squeezed(area):  # type: ignore[no-untyped-def]
+    """Return J - 1 - log J and its derivative, or of its parabola below `LEAST_LOG_AREA`."""
+    if area > LEAST_LOG_AREA:
+        return area - 1.0 - math.log(area), 1.0 - 1.0 / area
+    below = (area - LEAST_LOG_AREA) / LEAST_LOG_AREA
+    energy = area - 1.0 - math.log(LEAST_LOG_AREA) - below + 0.5 * below * below
+    return energy, 1.0 - (1.0 - below) / LEAST_LOG_AREA
+
+
 @njit(parallel=True, cache=True, fastmath=True)
 def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: ignore[no-untyped-def]
     """Add the forces of the stretched membrane to ``force``; return its energy, summed over nodes.
@@ -51,7 +64,8 @@ def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: 
         Mean deformation gradient.
     bulk : float
         Stiffness of the tissue's skin against losing area: bulk (J - 1 - log J) per area, J the
-        projected area over that of the affine state; 1e300 is returned where J <= 0.
+        projected area over that of the affine state. Below `LEAST_LOG_AREA` it continues as its
+        parabola, so that one point about to change sides does not stop the search of all others.
     texel : float
         Distance of nodes, um.
     force : ndarray (3, N, M)
@@ -92,21 +106,25 @@ def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: 
                 total += weight * (e1 + e2 + e3 + e4)
                 j1, j2 = b1 * l2 - b2 * l1, b1 * r2 - b2 * r1
                 j3, j4 = t1 * l2 - t2 * l1, t1 * r2 - t2 * r1
-                if min(min(j1, j2), min(j3, j4)) <= 1e-9 * whole:
-                    total += 1e300
-                    continue
-                total += (
-                    0.25
-                    * bulk
-                    * (
-                        (j1 + j2 + j3 + j4) / whole
-                        - 4.0
-                        - math.log(j1 * j2 * (j3 * j4) / (whole * whole * whole * whole))
-                    )
-                )
                 w = 0.25 * bulk * h
-                g1, g2 = w * (1.0 / whole - 1.0 / j1), w * (1.0 / whole - 1.0 / j2)
-                g3, g4 = w * (1.0 / whole - 1.0 / j3), w * (1.0 / whole - 1.0 / j4)
+                if min(min(j1, j2), min(j3, j4)) > LEAST_LOG_AREA * whole:
+                    total += (
+                        0.25
+                        * bulk
+                        * (
+                            (j1 + j2 + j3 + j4) / whole
+                            - 4.0
+                            - math.log(j1 * j2 * (j3 * j4) / (whole * whole * whole * whole))
+                        )
+                    )
+                    g1, g2 = w * (1.0 / whole - 1.0 / j1), w * (1.0 / whole - 1.0 / j2)
+                    g3, g4 = w * (1.0 / whole - 1.0 / j3), w * (1.0 / whole - 1.0 / j4)
+                else:
+                    (s1, g1), (s2, g2) = _squeezed(j1 / whole), _squeezed(j2 / whole)
+                    (s3, g3), (s4, g4) = _squeezed(j3 / whole), _squeezed(j4 / whole)
+                    total += 0.25 * bulk * (s1 + s2 + s3 + s4)
+                    g1, g2 = w * g1 / whole, w * g2 / whole
+                    g3, g4 = w * g3 / whole, w * g4 / whole
                 w = weight * h
                 ab, at, al, ar = w * (a1 + a2), w * (a3 + a4), w * (d1 + d3), w * (d2 + d4)
                 c1, c2, c3, c4 = w * c1, w * c2, w * c3, w * c4

@@ -21,7 +21,11 @@ from rigsim.skin_patch.stretch import (
     required_size_mm,
     stretch_skin,
 )
-from rigsim.skin_patch.stretch_kernels import add_bending_forces, add_membrane_forces
+from rigsim.skin_patch.stretch_kernels import (
+    LEAST_LOG_AREA,
+    add_bending_forces,
+    add_membrane_forces,
+)
 from rigsim.subject.person_skin import SiteSkin
 from rigsim.tissue.skin_layers import TYPICAL_SKIN
 
@@ -74,14 +78,17 @@ def problem_of(rng: np.random.Generator, *, gradient: Floats | None = None) -> L
     )
 
 
-def test_the_membranes_energy_is_that_of_its_metric(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("deviation_um", "inverted"), [(0.8, False), (6.0, True)])
+def test_the_membranes_energy_is_that_of_its_metric(
+    rng: np.random.Generator, deviation_um: float, inverted: bool
+) -> None:
     # Plain NumPy, by metric tensors, of the same flat elements.
     p = problem_of(rng)
-    v = p.affine() + 0.8 * rng.standard_normal((3, 12, 16))
+    v = p.affine() + deviation_um * rng.standard_normal((3, 12, 16))
     force = np.zeros_like(v)
     bulk = 3.0
     got = add_membrane_forces(v, p.neutral_um, p.membrane_um, p.gradient, bulk, p.texel_um, force)
-    expected = 0.0
+    expected, least = 0.0, np.inf
     whole = np.linalg.det(p.gradient)
 
     def edge(a: Floats, axis: int, side: int) -> Floats:
@@ -104,18 +111,31 @@ def test_the_membranes_energy_is_that_of_its_metric(rng: np.random.Generator) ->
             trace, det = np.trace(c, axis1=-2, axis2=-1), np.linalg.det(c)
             w = 0.5 * np.sqrt(np.linalg.det(g0)) * (trace + 1.0 / det - 3.0)
             j = np.linalg.det(first[..., :2, :]) / whole
-            expected += 0.25 * float(np.sum(square * w + bulk * (j - 1.0 - np.log(j))))
+            # Taylor's parabola of -log J below 0.05
+            low, off = np.maximum(j, LEAST_LOG_AREA), np.minimum(j / LEAST_LOG_AREA - 1.0, 0.0)
+            minus_log = -np.log(low) - off + 0.5 * off**2
+            expected += 0.25 * float(np.sum(square * w + bulk * (j - 1.0 + minus_log)))
+            least = min(least, float(j.min()))
+    assert (least < -0.1) == inverted
     assert got == pytest.approx(expected, rel=1e-10)
 
 
-def test_squeeze_inverting_an_element_has_unbounded_energy(rng: np.random.Generator) -> None:
+def test_inverted_elements_are_pushed_back_smoothly(rng: np.random.Generator) -> None:
     p = problem_of(rng)
-    v = p.affine()
-    v[0, 3, 3] += 30.0
-    force = np.zeros_like(v)
-    assert (
-        add_membrane_forces(v, p.neutral_um, p.membrane_um, p.gradient, 1.0, 10.0, force) >= 1e300
-    )
+    start = p.affine()
+
+    def energy(push_um: float) -> tuple[float, float]:
+        v, force = start.copy(), np.zeros_like(start)
+        v[0, 3, 3] += push_um
+        given = p.neutral_um, p.membrane_um, p.gradient, 1e3, p.texel_um
+        return add_membrane_forces(v, *given, force), float(force[0, 3, 3])
+
+    for push_um in np.linspace(0.0, 30.0, 61):  # elements are inverted beyond 8 um
+        (after, _), (before, _) = energy(push_um + 1e-4), energy(push_um - 1e-4)
+        assert energy(push_um)[1] == pytest.approx((after - before) / 2e-4, rel=1e-3, abs=0.02)
+    energies = [energy(push_um)[0] for push_um in (0.0, 8.0, 16.0, 30.0)]
+    assert np.isfinite(energies).all()
+    assert (np.diff(energies) > 0).all()
 
 
 def test_bending_costs_nothing_at_the_neutral_curvature(rng: np.random.Generator) -> None:
