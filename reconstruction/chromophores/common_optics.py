@@ -25,6 +25,10 @@ from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_MELANIN,
 )
 
+FACE_BLOOD_LOG_SD: Final = 0.9
+"""Standard deviation over people of the log of a face's median blood. Published blood volume
+fractions of skin, 0.002 to 0.07, are read as +-2 of them, as the ranges of
+`model.tissue_optics.uncertainty` are. `POPULATION_LOG_SD` is of single pixels, lips included."""
 LOG_FRACTION_STEP: Final = 0.05
 """Step of the grid in log melanin and in log blood, at most a third of their standard errors."""
 
@@ -111,7 +115,7 @@ def estimate_common_optics(
     cost = (rest * weighted[..., 0]).sum(axis=-1) + np.linalg.slogdet(whole)[1]
     for fraction, usual, sd in (
         (c_m, POPULATION_MELANIN, POPULATION_LOG_SD[0]),
-        (c_hd, POPULATION_BLOOD, POPULATION_LOG_SD[1]),
+        (c_hd, POPULATION_BLOOD, FACE_BLOOD_LOG_SD),
     ):
         cost = cost + np.square(np.log(fraction / usual) / sd)
     weight = np.exp(-0.5 * (cost - cost.min()))
