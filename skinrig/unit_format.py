@@ -1,5 +1,8 @@
-"""Format numbers with units, for pages and for the terminal."""
+"""Format numbers with units, for pages and for the terminal, and tables as CSV."""
 
+import csv
+import io
+from collections.abc import Iterable
 from typing import Final
 
 DEGREE_SIGN: Final = "°"
@@ -44,3 +47,38 @@ def format_quantity(number: str, unit: str) -> str:
     """
     sign = format_unit(unit)
     return number + ("" if sign == DEGREE_SIGN or not sign else " ") + sign
+
+
+def format_csv(rows: Iterable[Iterable[object]]) -> str:
+    r"""Return rows as CSV in which no text is a formula.
+
+    Spreadsheets run a cell that begins with one of ``= + - @``, also after blanks. Names in other
+    people's sessions may be such; an apostrophe before them makes them text. Numbers given as text
+    stay; carriage returns become blanks.
+
+    Parameters
+    ----------
+    rows
+        Cells, row by row.
+
+    Examples
+    --------
+    >>> format_csv([("name", "error"), ("=HYPERLINK(1)", -0.5), ("-x", "-1e-3")])
+    "name,error\n'=HYPERLINK(1),-0.5\n'-x,-1e-3\n"
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(
+        [_disarm(cell) if isinstance(cell, str) else cell for cell in row] for row in rows
+    )
+    return text.getvalue()
+
+
+def _disarm(cell: str) -> str:
+    cell = cell.replace("\r", " ")  # would end a row
+    if not cell.lstrip().startswith(("=", "+", "-", "@")):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell

@@ -1,13 +1,11 @@
 """Analyze the albedo of faces: color histograms of groups (fig. 16), and principal components."""
 
-import csv
 import dataclasses
-import io
 import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +29,7 @@ from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample
 from skinrig.traits.truth import label_members
+from skinrig.unit_format import format_csv
 
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
@@ -235,8 +234,8 @@ def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
     document = {"schema": "skinrig.analyse-albedo/1", **found.document()}
     contents = (
         _figure(found),
-        _table(_histogram_rows(found)),
-        _table(_component_rows(found)),
+        format_csv(_histogram_rows(found)).encode(),
+        format_csv(_component_rows(found)).encode(),
         (json.dumps(document, indent=1) + "\n").encode(),
     )
     part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
@@ -250,12 +249,6 @@ def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return found
-
-
-def _table(rows: Iterable[Sequence[object]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
 
 
 def _histogram_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:

@@ -8,8 +8,6 @@ the p-value of all pixels is listed next to that of pixels a correlation length 
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Mapping
@@ -33,6 +31,7 @@ from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.atomic_file import write_atomically
 from skinrig.errors import UnusableError
+from skinrig.unit_format import format_csv
 
 DEFAULT_RADIUS_DIVISOR: Final = 32.0
 """Larger side of the map over the radius of the local statistics, as in `fit facial-color`."""
@@ -247,7 +246,7 @@ def analyze_blood(
     }
     contents: tuple[str | bytes, ...] = (
         _draw(np.where(valid, blood, np.nan), places, found, radius),
-        _table(document["regions"]),
+        format_csv([document["regions"][0], *(one.values() for one in document["regions"])]),
         json.dumps(document, indent=1),
     )
     for file, content in zip(OUTPUT_FILES, contents, strict=True):
@@ -300,14 +299,6 @@ def _share_of_discs(blood: Any, valid: BoolArray, radius: float) -> dict[str, fl
     good = valid & (deviation > 0)
     away = np.abs(blood[good] - mean[good]) / deviation[good]
     return {"within_1_sd": float(np.mean(away < 1.0)), "within_2_sd": float(np.mean(away < 2.0))}
-
-
-def _table(regions: list[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    rows = csv.DictWriter(text, list(regions[0]), lineterminator="\n")
-    rows.writeheader()
-    rows.writerows(regions)
-    return text.getvalue()
 
 
 def _draw(

@@ -1,6 +1,5 @@
 """Analyze the number of basis BRDFs that surfaces of faces need (figures 14 and 15)."""
 
-import csv
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -26,6 +25,7 @@ from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 from skinrig.traits import labels as trait_labels
+from skinrig.unit_format import format_csv
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
 SESSIONS_DATA: Final = "sessions of the light dome"
@@ -363,14 +363,15 @@ def _write(
         "datasets": [one.document() for one in found],
     }
     (out / "analysis.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    with (out / "curves.csv").open("w", newline="", encoding="utf-8") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-        table.writerow(("dataset", "rank", "error", "normalized", "held_out", "held_out_stderr"))
-        for one in found:
-            curve = one.curve
-            for k, rank in enumerate(curve.ranks):
-                values = (curve.error, curve.normalized(), curve.held_out, curve.held_out_stderr)
-                table.writerow((one.data.name, rank, *(f"{v[k]:.6g}" for v in values)))
+    rows: list[Sequence[object]] = [
+        ("dataset", "rank", "error", "normalized", "held_out", "held_out_stderr")
+    ]
+    for one in found:
+        curve = one.curve
+        for k, rank in enumerate(curve.ranks):
+            values = (curve.error, curve.normalized(), curve.held_out, curve.held_out_stderr)
+            rows.append((one.data.name, rank, *(f"{v[k]:.6g}" for v in values)))
+    (out / "curves.csv").write_text(format_csv(rows), encoding="utf-8")
     curves = {one.data.name: one.curve for one in found}
     (out / "figure-15.png").write_bytes(brdf_space_figures.curves(curves))
     (out / "figure-14.png").write_bytes(brdf_space_figures.draw_spheres(spheres.means, basis))

@@ -1,13 +1,12 @@
 """Print and write the tables, verdicts and plots of a benchmark."""
 
-import csv
-import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from skinrig.atomic_file import write_atomically
 from skinrig.console import Console
+from skinrig.unit_format import format_csv
 
 _POINT_COLUMNS = (
     "seconds",
@@ -152,20 +151,12 @@ def write_tables(document: Mapping[str, Any], out: Path) -> None:
         for point in stage["points"]
     ]
     head = ("stage", "size", "setting", "error is", *_POINT_COLUMNS, "low", "high", "front", "knee")
-    write_atomically(out / "bench.csv", _csv(head, rows))
-    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, list_band_rows(document)))
+    write_atomically(out / "bench.csv", format_csv([head, *rows]))
+    write_atomically(out / "bench-bands.csv", format_csv([BAND_COLUMNS, *list_band_rows(document)]))
     for name, stage in document["stages"].items():
         if stage["points"]:
             plot = bench_figures.plot_error_against_time(name, stage)
             write_atomically(out / f"{name}.svg", plot + "\n")
-
-
-def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(head)
-    table.writerows(rows)
-    return text.getvalue()
 
 
 def format_knobs(point: Mapping[str, Any]) -> str:

@@ -1,7 +1,5 @@
 """Write the results of a study: a table of cases, coverage by part of the cases, and a page."""
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +14,7 @@ from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, pool_trials, 
 from skinrig.console import to_json_value
 from skinrig.studies.cases import JudgedQuantity
 from skinrig.studies.description import MEDIUM_TYPE, Case
+from skinrig.unit_format import format_csv
 
 RESULTS_SCHEMA: Final = "skinrig.study_results/1"
 TABLE_FILE: Final = "study.csv"
@@ -92,9 +91,7 @@ def format_table(
 
     Parameters are those of `write_results`.
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(TABLE_COLUMNS)
+    rows: list[Sequence[object]] = [TABLE_COLUMNS]
     for key, case in cases.items():
         head = (
             *(key, case.rig, case.subject, case.skin, case.seed, case.setup),
@@ -103,10 +100,10 @@ def format_table(
         for row in quantities.get(key, ()):
             figures = (row.error, row.width, row.unit, row.inside_68, row.inside_95)
             cells = (format(one, ".6g") if isinstance(one, float) else one for one in figures)
-            writer.writerow((*head, row.quantity, row.truths, *cells, ""))
+            rows.append((*head, row.quantity, row.truths, *cells, ""))
         if key in errors:
-            writer.writerow((*head, *[""] * 7, " ".join(errors[key].split())))
-    return stream.getvalue()
+            rows.append((*head, *[""] * 7, " ".join(errors[key].split())))
+    return format_csv(rows)
 
 
 def summarize(
@@ -138,9 +135,7 @@ def summarize(
 
 def format_summary(document: Mapping[str, Any]) -> str:
     """Return the document of `summarize` as CSV: a row per quantity and part of the cases."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(SUMMARY_COLUMNS)
+    rows: list[Sequence[object]] = [SUMMARY_COLUMNS]
     for row in [*document["quantities"], *document["cells"]]:
         figures = [row[name] for name in ("median_error", "half_width")]
         cells = [format(one, ".4g") for one in figures] + [row["unit"]]
@@ -150,8 +145,8 @@ def format_summary(document: Mapping[str, Any]) -> str:
         keys = (
             ALL_SKIN if row[name] is None else format(row[name], "g") for name in CASE_CONDITIONS
         )
-        writer.writerow((row["quantity"], row["skin"], *keys, row["cases"], *cells))
-    return stream.getvalue()
+        rows.append((row["quantity"], row["skin"], *keys, row["cases"], *cells))
+    return format_csv(rows)
 
 
 def _list_parts(judged: Sequence[JudgedCase]) -> Iterator[Part]:

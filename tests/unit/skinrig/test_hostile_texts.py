@@ -1,15 +1,20 @@
 """Names and notes of a stranger's session are text in pages and terminals, never commands."""
 
+import csv
+import io
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 
 from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session, SubjectRecord
+from skinrig import unit_format
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.reporting import report
+from skinrig.unit_format import format_csv
 
 RIG = load_rig("flash").resized(16)
 HOSTILE = "</script></style>--><hostile onload=1>\"'<hostile a=`x`>${1}&lt;\x1b[2J\x9b31m\u202e"
@@ -77,3 +82,16 @@ def test_console_escapes_what_commands_a_terminal(as_json, capsys):
     assert "\\x1b]0;title" in text
     assert "\\udc80" in text
     assert not {"\x1b", "\r"} & set(text)
+
+
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1"])
+def test_text_in_csv_is_no_formula(text):
+    (cells,) = csv.reader(io.StringIO(format_csv([(text, -1.5, "-1.5", "a=b")]), newline=""))
+    assert cells == ["'" + text.replace("\r", " "), "-1.5", "-1.5", "a=b"]
+
+
+def test_every_written_csv_passes_the_guard():
+    root = Path(unit_format.__file__).parent
+    writers = [p.name for p in root.rglob("*.py") if "csv.writer(" in p.read_text("utf-8")]
+    assert writers == ["unit_format.py"]
+    assert not [p for p in root.rglob("*.py") if "DictWriter" in p.read_text("utf-8")]
