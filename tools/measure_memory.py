@@ -88,7 +88,9 @@ def main() -> None:
     order = parser.parse_args()
     order.work.mkdir(parents=True, exist_ok=True)
     table = csv.writer(sys.stdout)
-    table.writerow("work,size,camera_mp,frame_mp,code,cpu_s,peak_mb,space_mb,disk_mb".split(","))
+    table.writerow(
+        "work,size,camera_mp,frame_mp,state_mp,code,cpu_s,peak_mb,space_mb,disk_mb".split(",")
+    )
     for rig in order.rigs.split(","):
         for number, size in enumerate(SIZES[order.sizes][rig]):
             name = f"{rig}-{order.sizes}{number}"
@@ -96,7 +98,7 @@ def main() -> None:
             run = ("simulate", rig, *size, "--subject", "III", "--out", str(session))
             measured = measure(run)
             opened = Session.open(session)
-            pixels = count_megapixels(opened.rig, opened.plan)
+            pixels = count_megapixels(opened.rig, opened.plan, opened.omitted_steps())
             disk_mb = measure_folder_mb(session) + measure_folder_mb(order.work / f"truth-{name}")
             label = " ".join(size)
             table.writerow((f"simulate {rig}", label, *pixels.values(), *measured, disk_mb))

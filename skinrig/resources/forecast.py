@@ -7,7 +7,7 @@ coefficients in `data/memory.toml` are set on.
 import math
 import shutil
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -23,8 +23,9 @@ MEMORY_TABLE: Final = resources.files("skinrig").joinpath("data/memory.toml")
 
 
 Amounts = Mapping[str, float]
-"""Sizes that memory and disk depend on: "camera_mp" and "frame_mp", megapixels of the cameras and
-of all frames; "source_mb", bytes of the folder to be exported."""
+"""Sizes that memory and disk depend on: "camera_mp", "frame_mp", "state_mp", megapixels of the
+cameras, of all frames, and of one frame per state of the caliper; "source_mb", bytes of the folder
+to be exported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +53,15 @@ class ResourceForecast:
         return self.memory_mb <= free.memory_mb and self.space_mb <= free.space_mb
 
 
-def count_megapixels(rig: Rig, plan: Plan) -> Amounts:
-    """Return the megapixels of the cameras in use, and of all frames of a plan.
+def count_megapixels(rig: Rig, plan: Plan, omitted: Container[str] = ()) -> Amounts:
+    """Return the megapixels of the cameras in use, of all frames of a plan, and of all its states.
+
+    Parameters
+    ----------
+    rig, plan
+        The plan, and its rig.
+    omitted
+        Steps of the plan that were not captured.
 
     Examples
     --------
@@ -61,13 +69,16 @@ def count_megapixels(rig: Rig, plan: Plan) -> Amounts:
     >>> from capture.rig import load_rig
     >>> rig = load_rig("flash").resized(128)
     >>> {name: round(number, 3) for name, number in count_megapixels(rig, flash_plan(rig)).items()}
-    {'camera_mp': 0.011, 'frame_mp': 0.066}
+    {'camera_mp': 0.011, 'frame_mp': 0.066, 'state_mp': 0.0}
     """
     megapixels = {view.name: view.width_px * view.height_px * 1e-6 for view in rig.all_views}
-    used = {name for step in plan.steps for name in step.cameras}
+    steps = [step for step in plan.steps if step.id not in omitted]
+    camera_mp = sum(megapixels[name] for name in {name for step in steps for name in step.cameras})
+    states = {(step.index.get("angle"), step.index.get("caliper")) for step in steps}
     return {
-        "camera_mp": sum(megapixels[name] for name in used),
-        "frame_mp": sum(megapixels[name] for step in plan.steps for name in step.cameras),
+        "camera_mp": camera_mp,
+        "frame_mp": sum(megapixels[name] for step in steps for name in step.cameras),
+        "state_mp": camera_mp * len(states - {(None, None)}),
     }
 
 

@@ -116,7 +116,8 @@ def _require_room(orders: Sequence[ReconstructionOrder], executor: str) -> None:
             continue
         if "light_list" not in session.manifest.extra and not _has_maps(order, session):
             work = f"reconstruct {find_rig_kind(session.rig)}"
-            jobs.append([Task(work, count_megapixels(session.rig, session.plan))])
+            sizes = count_megapixels(session.rig, session.plan, session.omitted_steps())
+            jobs.append([Task(work, sizes)])
             held_mb += measure_folder_mb(order.out) + measure_folder_mb(work_folder(order.out))
     processes = count_local_processes(executor)
     require_resources_of_jobs(jobs, orders[0].out, processes=processes, held_mb=held_mb)

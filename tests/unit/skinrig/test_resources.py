@@ -15,6 +15,7 @@ import pytest
 from fixtures.study_judge import judge_by_drawing
 
 from capture.plan.dome import dome_plan
+from capture.plan.gradient import gradient_plan
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
@@ -222,6 +223,28 @@ def test_bounded_caches_bound_forecasts(work, few, many, memory_mb):
     assert second.disk_mb > 1.5 * first.disk_mb
 
 
+def test_forecast_counts_captured_states_of_caliper():
+    rig = load_rig("gradient").resized(64)
+    plan = gradient_plan(rig, angles=(0.0, 90.0))
+    whole = resources.count_megapixels(rig, plan)
+    pixels = whole["camera_mp"]
+    states = {
+        (step.index.get("angle"), step.index["caliper"])
+        for step in plan.steps
+        if "caliper" in step.index
+    }
+    assert whole["state_mp"] == pytest.approx(len(states) * pixels)
+    lost = {step.id for step in plan.steps if step.index.get("angle") == 90}
+    some = resources.count_megapixels(rig, plan, lost)
+    assert 0.0 < some["state_mp"] < whole["state_mp"]
+    assert some["camera_mp"] == pixels
+    one, two = (
+        resources.forecast_resources("simulate gradient", sizes).memory_mb
+        for sizes in (some, whole)
+    )
+    assert two > one
+
+
 def test_bound_of_frames_leaves_cameras():
     one, two = (
         resources.forecast_resources("simulate gradient", {"camera_mp": n, "frame_mp": 3498.0})
@@ -255,7 +278,11 @@ def test_earlier_demo_leaves_its_disk(tmp_path, free, monkeypatch):
 def test_reconstruction_without_memory_is_refused_first(tmp_path, free, monkeypatch):
     rig = load_rig("dome")
     opened = SimpleNamespace(
-        manifest=SimpleNamespace(extra={}), rig=rig, plan=dome_plan(rig), content_hash="sha256:0"
+        manifest=SimpleNamespace(extra={}),
+        rig=rig,
+        plan=dome_plan(rig),
+        content_hash="sha256:0",
+        omitted_steps=dict,
     )
     monkeypatch.setattr(reconstruction.Session, "open", lambda path: opened)
     monkeypatch.setattr(reconstruction, "reconstruct_session", refuse_scene)
