@@ -57,6 +57,8 @@ class PhotoImport:
     """Omitted files that are not photographs."""
     color_states: tuple[str, ...] = ()
     """Subset of `states` with color photographs; chromophores need color."""
+    has_pairs: bool = False
+    """Whether a state has a parallel and a crossed photograph of one size and color."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,8 @@ def import_photos(
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
-    return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored)
+    pairs = any(len({e.camera[1:3] for e in pair}) == 1 for pair in _group_pairs(steps))
+    return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored, pairs)
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
@@ -374,14 +377,19 @@ def _assumptions(
     return texts
 
 
+def _group_pairs(steps: Sequence[tuple[Step, _Entry]]) -> list[list[_Entry]]:
+    """Return the photographs of each state that has two polarizer states."""
+    states: dict[object, list[_Entry]] = {}
+    for step, entry in steps:
+        states.setdefault(step.index["state"], []).append(entry)
+    return [entries for entries in states.values() if len(entries) > 1]
+
+
 def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
     """Return the pairs of polarizer states whose photographs cannot be subtracted."""
-    pairs: dict[object, list[_Entry]] = {}
-    for step, entry in steps:
-        pairs.setdefault(step.index["state"], []).append(entry)
     return [
         f"{' and '.join(entry.file.name for entry in pair)} {UNEQUAL_PAIR_NOTE}"
-        for pair in pairs.values()
+        for pair in _group_pairs(steps)
         if len({(entry.view.cfa, entry.view.width_px, entry.view.height_px) for entry in pair}) > 1
     ]
 
