@@ -97,7 +97,7 @@ def test_maps_of_patterns_name_remaining_faults(images, fault, tmp_path, capsys)
     [
         ("", []),
         ("exchanged", ["exchanged polarizers"]),
-        ("crossed exposed twice", ["unequal exposures"]),
+        ("crossed exposed longer", ["unequal exposures"]),
     ],
 )
 def test_imported_pair_and_its_maps_name_faults(fault, names, tmp_path, capsys):
