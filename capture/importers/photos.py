@@ -76,6 +76,8 @@ class _Entry:
     framing: Framing
     face: tuple[float, ...]
     """Square of the face relative to the image, see `Framing.locate`; empty: not looked for."""
+    turn_raw: bool = True
+    """See `read_photo`."""
 
     @property
     def camera(self) -> tuple[object, ...]:
@@ -150,7 +152,7 @@ def import_photos(
             faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
             advice="Leave the rig out, or crop and width.",
         )
-    entries = _inspect(files, framing)
+    entries = _inspect(files, framing, turn_raw=rig is None)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
@@ -207,13 +209,16 @@ def _advise(names: Sequence[str]) -> str:
     return next((text for name in names if (text := advise_conversion(name))), "")
 
 
-def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
-    """Decode every file once, so that a bad one is found before anything is written."""
+def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list[_Entry]:
+    """Decode every file once, so that a bad one is found before anything is written.
+
+    Calibrations of a rig apply to the rows of its sensor: its raw files are not turned.
+    """
     entries, faults = [], []
     placed: dict[tuple[str, tuple[int, ...]], tuple[Framing, tuple[float, ...]]] = {}
     for file in files:
         try:
-            photo = read_photo(file)
+            photo = read_photo(file, turn_raw=turn_raw)
             if photo.white_value == 0.0:
                 raise PhotoError("is black", where=str(file))
         except InputError as exc:
@@ -226,7 +231,8 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
         if key not in placed:
             placed[key] = framing.locate(photo, where=str(file))
         own, face = placed[key]
-        entries.append(_entry(file, own.apply(photo, where=str(file)), own, face))
+        made = _entry(file, own.apply(photo, where=str(file)), own, face)
+        entries.append(replace(made, turn_raw=turn_raw))
     if faults:
         raise PhotoError(
             f"{len(faults)} of {len(files)} files cannot be imported",
@@ -396,7 +402,7 @@ def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
 
 def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
     (view,) = step.cameras
-    photo = read_photo(entry.file, white_value=entry.white_value)
+    photo = read_photo(entry.file, white_value=entry.white_value, turn_raw=entry.turn_raw)
     frame = replace(
         entry.framing.apply(photo, where=str(entry.file)).frame,
         camera_serial=session.rig.view(view).serial,
