@@ -98,6 +98,7 @@ def import_photos(
     kind: Kind = "subject",
     subject: SubjectRecord | None = None,
     framing: Framing | None = None,
+    assumed: Sequence[str] = (),
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -128,6 +129,8 @@ def import_photos(
         Person in the photographs; default an unnamed one who agreed to nothing beyond the capture.
     framing : Framing, optional
         Part and width of the photographs to import; default: all of them.
+    assumed : sequence of str
+        What the caller assumed; stored before the import's own assumptions.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -156,8 +159,8 @@ def import_photos(
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
-    assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
-    assumed += _list_unequal_partners(steps)
+    own = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    assumed = [*assumed, *own, *_list_unequal_partners(steps)]
     plan = Plan(used.name, tuple(step for step, _ in steps))
     listed = [
         {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}

@@ -44,6 +44,8 @@ class DiagnosedImages:
         Of images under listed lights; None: of other sessions.
     listed
         (N, 3), unit vectors of the list, in the order of the images; None: of other sessions.
+    assumed
+        What the import of the images assumed, such as the loss by compression of a video.
     """
 
     findings: tuple[Finding, ...]
@@ -51,6 +53,7 @@ class DiagnosedImages:
     gray: Sequence[NDArray[Any]] | NDArray[Any]
     diagnosis: Diagnosis | None = None
     listed: Float64Array | None = None
+    assumed: tuple[str, ...] = ()
 
     def name_images(self, one: Finding) -> str:
         """Return the names of a finding's images; "all" for one of all images."""
@@ -76,6 +79,7 @@ class DiagnosedImages:
         found: dict[str, Any] = {
             "findings": [one.to_json() for one in self.findings],
             "names": list(self.names),
+            "assumed": list(self.assumed),
         }
         if self.diagnosis is None:
             return found

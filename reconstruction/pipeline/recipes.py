@@ -190,7 +190,9 @@ def diagnose(session: str | Path) -> DiagnosedImages:
             f"{opened.path}: got a session of the rig {opened.rig.name!r}, expected images under "
             "listed lights, polarized pairs or gradient patterns; other images have no rules"
         )
-    return recipe.diagnose(opened)
+    assumed = opened.manifest.extra.get("assumed", [])
+    lines = tuple(map(str, assumed)) if isinstance(assumed, list) else ()
+    return replace(recipe.diagnose(opened), assumed=lines)
 
 
 def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions) -> None:

@@ -52,7 +52,7 @@ def import_photos(
     Parameters
     ----------
     directory
-        Folder of photographs, or one file.
+        Folder of photographs, one file, or a video, whose frames are read.
     rig
         Rig whose camera took the photographs, so that its calibrations apply; default: none.
     target
@@ -67,19 +67,22 @@ def import_photos(
     """
     from capture.importers import import_photos as bring_in
     from capture.importers.framing import Framing
+    from capture.importers.video_frames import open_source
     from capture.rig import load_rig
     from skinrig.consent import parse_subject
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    done = bring_in(
-        directory,
-        out=out,
-        rig=None if rig is None else load_rig(rig),
-        kind="chart" if target else "subject",
-        subject=person,
-        framing=Framing.parse(crop, width),
-    )
+    with open_source(directory) as source:
+        done = bring_in(
+            source.path,
+            out=out,
+            rig=None if rig is None else load_rig(rig),
+            kind="chart" if target else "subject",
+            subject=person,
+            framing=Framing.parse(crop, width),
+            assumed=source.assumed,
+        )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)
     console.print_line(
@@ -218,7 +221,7 @@ def import_olat(
     Parameters
     ----------
     directory
-        Folder of images, one per light.
+        Folder of images, or a video, one per light.
     lights
         Light list: .lp, text, JSON or NumPy file, or folder of a chrome ball's images; estimate:
         from the images alone; default: found in the folder.
@@ -235,30 +238,33 @@ def import_olat(
         Pseudonym of the subject; none: a thing, which needs no consent.
     """
     from capture.importers import import_light_list
+    from capture.importers.video_frames import open_source
     from skinrig.consent import parse_subject
-    from skinrig.importing.light_stacks import find_lights
+    from skinrig.importing.light_stacks import find_lights, require_list_of_video
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    found = find_lights(
-        directory,
-        lights=lights,
-        mask=mask,
-        encoding=encoding,  # type: ignore[arg-type]
-        camera=camera,
-        mm_per_px=mm_per_px,
-    )
-    done = import_light_list(
-        directory,
-        out=out,
-        lights=found.lights,
-        mask=mask,
-        encoding=encoding,  # type: ignore[arg-type]
-        resolved_encoding=found.encoding,
-        mm_per_px=mm_per_px,
-        subject=person,
-        assumed=found.assumed,
-    )
+    require_list_of_video(directory, lights)
+    with open_source(directory) as source:
+        found = find_lights(
+            source.path,
+            lights=lights,
+            mask=mask,
+            encoding=encoding,  # type: ignore[arg-type]
+            camera=camera,
+            mm_per_px=mm_per_px,
+        )
+        done = import_light_list(
+            source.path,
+            out=out,
+            lights=found.lights,
+            mask=mask,
+            encoding=encoding,  # type: ignore[arg-type]
+            resolved_encoding=found.encoding,
+            mm_per_px=mm_per_px,
+            subject=person,
+            assumed=(*source.assumed, *found.assumed),
+        )
     console.print_each("assumed", done.assumed)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
@@ -301,6 +307,7 @@ def diagnose(
     console = Console(json)
     console.progress("read the images and compare them with each other")
     found = recipes.diagnose(session)
+    console.print_each("assumed", found.assumed)
     if not _print_findings(console, found):
         console.print_line(f"{session}: no fault was found in {len(found.names)} images")
     if out is not None:

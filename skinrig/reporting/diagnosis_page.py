@@ -50,6 +50,8 @@ def build_diagnosis_page(name: str, found: DiagnosedImages) -> str:
     if rows:
         head = ("fault", "images", "over its limit", "evidence", "remedy")
         lead.append(page.build_table(head, rows, caption="The most certain fault comes first"))
+    if found.assumed:
+        lead.append(page.Bullets([f"assumed: {text}" for text in found.assumed]))
     return page.render_page(f"diagnosis of {Path(name).name}", lead, _sections(found))
 
 
