@@ -17,7 +17,8 @@ MAX_IMAGE_SIDE_PX = 32_767
 _IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
 
 
-VIDEO_ADVICE = "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
+FRAMES_ADVICE = "Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one."
+VIDEO_ADVICE = f"Name the video itself in `skinrig import olat` or `photos`. Or: {FRAMES_ADVICE}"
 CONVERSION_ADVICE = "Convert it to TIFF or PNG of 16 bits, or set the camera to JPEG or RAW."
 VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
 VIDEO_BRANDS = (b"isom", b"mp42", b"qt  ", b"avc1", b"M4V ", b"AVI ")

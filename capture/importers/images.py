@@ -64,10 +64,12 @@ class Photo:
     """Value of a floating-point file that is stored as white, 0 for a black one; None: the file
     contains integers."""
     orientation: int = 1
-    """EXIF orientation of a JPEG, PNG or TIFF, 1 to 8, by which its pixels were turned upright."""
+    """EXIF orientation, 1 to 8, by which the pixels were turned upright."""
 
 
-def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
+def read_photo(
+    path: str | Path, *, white_value: float | None = None, turn_raw: bool = True
+) -> Photo:
     """Read a RAW, TIFF, OpenEXR, PNG or JPEG file; its content decides, not its name.
 
     Parameters
@@ -77,6 +79,8 @@ def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
     white_value : float, optional
         Value of floating-point files that is stored as white, so that several files keep their
         ratios; default: a little above the file's own maximum.
+    turn_raw : bool
+        Whether a RAW file is turned by its orientation, too; False: rows stay those of the sensor.
 
     Returns
     -------
@@ -103,7 +107,7 @@ def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
     if head.startswith(_TIFF_MAGICS) and file.suffix.lower() in _TIFF_SUFFIXES:
         return _tiff(file, where, white_value)
     require_photograph(file, head)
-    return _raw(file, where)
+    return _raw(file, where, turn=turn_raw)
 
 
 def _decode_srgb(values: FloatArray) -> FloatArray:
@@ -145,7 +149,7 @@ NOISE_NOTE = (
 )
 
 
-def _raw(file: Path, where: str) -> Photo:
+def _raw(file: Path, where: str, *, turn: bool) -> Photo:
     try:
         frame = raw.read(file)
     except raw.RawError as exc:
@@ -163,11 +167,31 @@ def _raw(file: Path, where: str) -> Photo:
         notes.append(NOISE_NOTE)
     if frame.neutral is None and frame.pattern != "MONO":
         notes.append("the file names no white balance, so its channels count as balanced")
+    orientation = frame.orientation if turn else 1
+    if orientation != frame.orientation:
+        notes.append(
+            f"EXIF orientation {frame.orientation} was not followed: rows are those of the sensor"
+        )
+    notes += note_orientation(orientation)
     # metadata that identify people, places and owners are dropped
     frame = replace(
-        frame, camera_serial="", captured_at=None, step_id="", session_id="", light={}, path=""
-    )
-    return Photo(frame, "raw", tuple(notes))
+        _turn_mosaic(frame, orientation),
+        camera_serial="", captured_at=None, step_id="", session_id="", light={}, path="",
+        orientation=1,
+    )  # fmt: skip
+    return Photo(frame, "raw", tuple(notes), orientation=orientation)
+
+
+def _turn_mosaic(frame: raw.RawFrame, orientation: int) -> raw.RawFrame:
+    """Return a frame turned upright, with the cell of its filter array turned alike."""
+    if orientation == 1:
+        return frame
+    cfa = np.ascontiguousarray(turn_upright(frame.cfa, orientation))
+    if frame.pattern == "MONO":
+        return replace(frame, cfa=cfa)
+    cell = turn_upright(np.arange(4).reshape(2, 2), orientation).ravel()  # sides are even
+    pattern = "".join(frame.pattern[k] for k in cell)
+    return replace(frame, cfa=cfa, pattern=pattern, black=tuple(frame.black[k] for k in cell))
 
 
 def _frame(values: UInt16Array, black: int) -> raw.RawFrame:

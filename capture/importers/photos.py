@@ -57,6 +57,8 @@ class PhotoImport:
     """Omitted files that are not photographs."""
     color_states: tuple[str, ...] = ()
     """Subset of `states` with color photographs; chromophores need color."""
+    has_pairs: bool = False
+    """Whether a state has a parallel and a crossed photograph of one size and color."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,8 @@ class _Entry:
     framing: Framing
     face: tuple[float, ...]
     """Square of the face relative to the image, see `Framing.locate`; empty: not looked for."""
+    turn_raw: bool = True
+    """See `read_photo`."""
 
     @property
     def camera(self) -> tuple[object, ...]:
@@ -94,6 +98,7 @@ def import_photos(
     kind: Kind = "subject",
     subject: SubjectRecord | None = None,
     framing: Framing | None = None,
+    assumed: Sequence[str] = (),
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -124,6 +129,8 @@ def import_photos(
         Person in the photographs; default an unnamed one who agreed to nothing beyond the capture.
     framing : Framing, optional
         Part and width of the photographs to import; default: all of them.
+    assumed : sequence of str
+        What the caller assumed; stored before the import's own assumptions.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -148,12 +155,12 @@ def import_photos(
             faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
             advice="Leave the rig out, or crop and width.",
         )
-    entries = _inspect(files, framing)
+    entries = _inspect(files, framing, turn_raw=rig is None)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
-    assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
-    assumed += _list_unequal_partners(steps)
+    own = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    assumed = [*assumed, *own, *_list_unequal_partners(steps)]
     plan = Plan(used.name, tuple(step for step, _ in steps))
     listed = [
         {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}
@@ -168,7 +175,8 @@ def import_photos(
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
-    return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored)
+    pairs = any(len({e.camera[1:3] for e in pair}) == 1 for pair in _group_pairs(steps))
+    return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored, pairs)
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
@@ -204,13 +212,16 @@ def _advise(names: Sequence[str]) -> str:
     return next((text for name in names if (text := advise_conversion(name))), "")
 
 
-def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
-    """Decode every file once, so that a bad one is found before anything is written."""
+def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list[_Entry]:
+    """Decode every file once, so that a bad one is found before anything is written.
+
+    Calibrations of a rig apply to the rows of its sensor: its raw files are not turned.
+    """
     entries, faults = [], []
     placed: dict[tuple[str, tuple[int, ...]], tuple[Framing, tuple[float, ...]]] = {}
     for file in files:
         try:
-            photo = read_photo(file)
+            photo = read_photo(file, turn_raw=turn_raw)
             if photo.white_value == 0.0:
                 raise PhotoError("is black", where=str(file))
         except InputError as exc:
@@ -223,7 +234,8 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
         if key not in placed:
             placed[key] = framing.locate(photo, where=str(file))
         own, face = placed[key]
-        entries.append(_entry(file, own.apply(photo, where=str(file)), own, face))
+        made = _entry(file, own.apply(photo, where=str(file)), own, face)
+        entries.append(replace(made, turn_raw=turn_raw))
     if faults:
         raise PhotoError(
             f"{len(faults)} of {len(files)} files cannot be imported",
@@ -374,21 +386,26 @@ def _assumptions(
     return texts
 
 
+def _group_pairs(steps: Sequence[tuple[Step, _Entry]]) -> list[list[_Entry]]:
+    """Return the photographs of each state that has two polarizer states."""
+    states: dict[object, list[_Entry]] = {}
+    for step, entry in steps:
+        states.setdefault(step.index["state"], []).append(entry)
+    return [entries for entries in states.values() if len(entries) > 1]
+
+
 def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
     """Return the pairs of polarizer states whose photographs cannot be subtracted."""
-    pairs: dict[object, list[_Entry]] = {}
-    for step, entry in steps:
-        pairs.setdefault(step.index["state"], []).append(entry)
     return [
         f"{' and '.join(entry.file.name for entry in pair)} {UNEQUAL_PAIR_NOTE}"
-        for pair in pairs.values()
+        for pair in _group_pairs(steps)
         if len({(entry.view.cfa, entry.view.width_px, entry.view.height_px) for entry in pair}) > 1
     ]
 
 
 def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
     (view,) = step.cameras
-    photo = read_photo(entry.file, white_value=entry.white_value)
+    photo = read_photo(entry.file, white_value=entry.white_value, turn_raw=entry.turn_raw)
     frame = replace(
         entry.framing.apply(photo, where=str(entry.file)).frame,
         camera_serial=session.rig.view(view).serial,

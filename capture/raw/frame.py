@@ -70,6 +70,8 @@ class RawFrame:
     """Light of the frame: polarizer, power, token, analyzer."""
     path: str = ""
     """File the frame was read from, empty for a frame made in memory."""
+    orientation: int = 1
+    """EXIF orientation of a foreign file, 1 to 8, by which ``cfa`` is not turned; 1: upright."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector(

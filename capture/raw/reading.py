@@ -14,6 +14,8 @@ from capture.raw.tiff import Directory
 
 _RAW_ADVICE = "Give a raw file as the camera wrote it; for other images use skinrig import."
 _FLOAT_SAMPLES = 3
+_ORIENTATION_BY_FLIP = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
+"""EXIF orientation by LibRaw's flip: 4 exchanges rows and columns, 2 and 1 then reverse them."""
 
 
 def read(path: str | Path) -> RawFrame:
@@ -27,8 +29,9 @@ def read(path: str | Path) -> RawFrame:
     Returns
     -------
     RawFrame
-        The visible sensor values unchanged, uint16, shape (H, W). For a foreign file with an odd
-        visible area the last row or column is omitted, so that 2 x 2 cells are whole.
+        The visible sensor values unchanged, uint16, shape (H, W), in the sensor's rows whatever
+        the file's orientation. For a foreign file with an odd visible area the last row or column
+        is omitted, so that 2 x 2 cells are whole.
 
     Raises
     ------
@@ -141,6 +144,7 @@ def _translate(raw: Any, tags: Directory | None, where: str) -> RawFrame:
             black=tuple(float(levels[int(c)]) for c in cells),
             white=int(raw.white_level),
             path=where,
+            orientation=_ORIENTATION_BY_FLIP.get(int(raw.sizes.flip), 1),
             **description,
         )
     except RawError as exc:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from capture import raw
 from capture.session import Session
 from capture.session.view import FrameRecord
 from model.checks import Checks
@@ -19,11 +18,13 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.diagnosed_images import FAULTS_NOTE, DiagnosedImages
 from reconstruction.pipeline.inputs import Inputs, InputsError
+from reconstruction.pipeline.linear_frame import read_linear
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 6
+STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -73,13 +74,6 @@ class StackLights:
     alive: BoolArray
     stderr_rad: float
     """Standard error of the directions, where they were estimated from the images; else 0."""
-    faults: tuple[str, ...] = ()
-    """Faults of the images that the maps still have."""
-
-    @property
-    def warning(self) -> str:
-        """Mark for the description of each map; empty without faults."""
-        return f"; images have faults: {', '.join(self.faults)}" if self.faults else ""
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
@@ -92,16 +86,6 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("normals", "stack lights", "normals residual gray_albedo", partial(_normals, inputs)),
         stage("albedo", known, "albedo", partial(_albedo, inputs.session)),
     ]
-
-
-def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
-    """Return values (H, W, C) as fractions of the range, and which are not saturated (H, W)."""
-    if frame.pattern == "MONO":
-        (black,) = frame.black
-        values = (frame.cfa.astype(np.float32) - black) / np.float32(frame.white - black)
-        return values[..., None], frame.cfa < frame.white
-    image = raw.linear_rgb(frame, demosaic="superpixel")
-    return image.rgb, image.valid
 
 
 def _stack(session: Session) -> LightStack:
@@ -122,7 +106,7 @@ def _stack(session: Session) -> LightStack:
         gain /= level / level.mean()
     folder: Any = None
     for number, record in enumerate(records):
-        values, good = _linear(session.read(record))
+        values, good = read_linear(session.read(record))
         if number == 0:
             shape = (len(records), *good.shape)
             gray: Any = np.empty(shape, np.float32)
@@ -165,7 +149,8 @@ def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
     if np.count_nonzero(~found.left_out) >= MIN_KEPT_IMAGES:
         alive, corrected = ~found.left_out, ORDER_FAULTS | LEFT_OUT_FAULTS
     faults = dict.fromkeys(one.fault for one in found.findings if one.fault not in corrected)
-    return StackLights(vectors[found.order], near, scale, alive, stderr_rad, tuple(faults))
+    inputs.noted[FAULTS_NOTE] = list(faults)
+    return StackLights(vectors[found.order], near, scale, alive, stderr_rad)
 
 
 def _listed_lights(session: Session, stack: LightStack) -> tuple[Float64Array, bool, float]:
@@ -193,32 +178,8 @@ def _diagnose(stack: LightStack, vectors: Float64Array, *, near: bool) -> Diagno
     )
 
 
-@dataclass(frozen=True, slots=True)
-class DiagnosedStack:
-    """Images of a session with what is wrong with them.
-
-    Attributes
-    ----------
-    diagnosis
-        Of the images.
-    gray
-        (N, H, W), over exposure and strength of the light.
-    listed
-        (N, 3), unit vectors of the list, in the order of the images.
-    """
-
-    diagnosis: Diagnosis
-    gray: Float32Array
-    listed: Float64Array
-
-
-def diagnose_images(path: str | Path) -> DiagnosedStack:
-    """Diagnose the images of a session with a light list, and return them, too.
-
-    Parameters
-    ----------
-    path
-        The SESSION/ folder.
+def diagnose_images(session: Session) -> DiagnosedImages:
+    """Diagnose the images of a session with a light list.
 
     Raises
     ------
@@ -227,15 +188,11 @@ def diagnose_images(path: str | Path) -> DiagnosedStack:
     PhotometricStereoError
         If its images cannot be judged: too few, or without light.
     """
-    session = Session.open(path)
     stack = _stack(session)
     vectors, near, _ = _listed_lights(session, stack)
-    return DiagnosedStack(_diagnose(stack, vectors, near=near), stack.gray, unit_vectors(vectors))
-
-
-def diagnose_session(path: str | Path) -> Diagnosis:
-    """Diagnose the images of a session; see `diagnose_images`."""
-    return diagnose_images(path).diagnosis
+    found = _diagnose(stack, vectors, near=near)
+    names = tuple(str(number + 1) for number in range(len(stack.gray)))
+    return DiagnosedImages(found.findings, names, stack.gray, found, unit_vectors(vectors))
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
@@ -285,8 +242,8 @@ def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[
     stderr_rad = np.hypot(best.stderr_rad, lights.stderr_rad)
     each = stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
     relative = best.residual / np.where(valid, best.albedo, 1.0)
-    frame = "image frame: x right, y up, z towards the camera" + lights.warning
-    misfit = "root mean square misfit over albedo" + lights.warning
+    frame = "image frame: x right, y up, z towards the camera"
+    misfit = "root mean square misfit over albedo"
     return {
         "normals": masked_map(n, each, valid, MAP_UNITS["normals"], frame),
         "residual": masked_map(relative, None, valid, MAP_UNITS["residual"], misfit),
@@ -320,7 +277,7 @@ def _albedo(
         agrees = np.abs(stack.gray[number] - gray.albedo * shading) <= spread
         good = stack.usable[number] & agrees & (shading > 0.05) & gray.valid
         weight = np.where(good, shading, 0.0)
-        values, _ = _linear(session.read(stack.records[number]))
+        values, _ = read_linear(session.read(stack.records[number]))
         above = above + weight[..., None] * values * stack.gain[number, : values.shape[2]]
         below += weight * shading
     valid = gray.valid & (below > 0)
@@ -330,5 +287,5 @@ def _albedo(
     errors = np.broadcast_to(error[..., None], albedo.shape)
     if channels == 1:
         albedo, errors = albedo[..., 0], errors[..., 0]
-    what = "over what the lights give a white surface, up to one factor" + lights.warning
+    what = "over what the lights give a white surface, up to one factor"
     return masked_map(albedo, errors, valid, "1", what)

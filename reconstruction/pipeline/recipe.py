@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from capture.session import Session
 from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.diagnosed_images import DiagnosedImages
 from reconstruction.pipeline.inputs import Inputs
 
 
@@ -23,6 +24,8 @@ class Recipe:
     """Products by name, where a name means several, as one map for each state."""
     maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
     """Names of the maps for a number of basis BRDFs; None: this rig kind fits none."""
+    diagnose: Callable[[Session], DiagnosedImages] | None = None
+    """Finds faults of the images from their pixels; None: no rule covers this rig kind."""
     typical_seconds: Mapping[str, float] = field(default_factory=dict)
     """Processor seconds of the long stages at demo size, by the first word of their names."""
 

@@ -15,6 +15,7 @@ from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.checkpoints import Checkpoints
+from reconstruction.pipeline.diagnosed_images import FAULTS_NOTE, DiagnosedImages, mark_faults
 from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
 from reconstruction.pipeline.recipe import Recipe
 from reconstruction.pipeline.run_progress import RunProgress
@@ -24,7 +25,7 @@ def light_list_recipe() -> Recipe:
     """Return the recipe of imported images under listed lights, without a rig."""
     from reconstruction.pipeline import light_stack
 
-    return Recipe(light_stack.MAP_NAMES, light_stack.graph)
+    return Recipe(light_stack.MAP_NAMES, light_stack.graph, diagnose=light_stack.diagnose_images)
 
 
 def recipe_for_session(session: Session) -> Recipe:
@@ -167,6 +168,33 @@ def list_maps(session: str | Path) -> list[str]:
     return list(recipe_for_session(Session.open(session)).maps)
 
 
+def diagnose(session: str | Path) -> DiagnosedImages:
+    """Find what is wrong with a session's images from their pixels.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder: images under listed lights, polarized pairs, or gradient patterns.
+
+    Raises
+    ------
+    InputsError, SessionError
+        If the session has no such images, or is damaged.
+    PhotometricStereoError
+        If its images cannot be judged: too few, or without light.
+    """
+    opened = Session.open(session)
+    recipe = recipe_for_session(opened)
+    if recipe.diagnose is None:
+        raise InputsError(
+            f"{opened.path}: got a session of the rig {opened.rig.name!r}, expected images under "
+            "listed lights, polarized pairs or gradient patterns; other images have no rules"
+        )
+    assumed = opened.manifest.extra.get("assumed", [])
+    lines = tuple(map(str, assumed)) if isinstance(assumed, list) else ()
+    return replace(recipe.diagnose(opened), assumed=lines)
+
+
 def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions) -> None:
     options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
     given = [name for name, value in options.items() if value is not None]
@@ -215,6 +243,8 @@ def _appearance(
         names = previous.parameters.get("noted", [])
         texts = [str(name) for name in names] if isinstance(names, list) else []
         noted |= {n: previous.parameters.get(n) for n in texts if n not in noted}
+    faults = noted.get(FAULTS_NOTE, [])
+    kept = mark_faults(kept, faults if isinstance(faults, list) else [])
     return SkinAppearance(
         maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
         source=inputs.session.source,

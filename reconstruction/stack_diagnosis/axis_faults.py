@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import permutations, product
 
 import numpy as np
 
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array
-from reconstruction.stack_diagnosis.finding import Finding
+from reconstruction.stack_diagnosis.finding import Axes, Finding
 
 MIN_FACING = 0.8
 """Fraction of the normals that must face the camera."""
@@ -38,7 +38,7 @@ def find_axes(normals: Float64Array, valid: BoolArray) -> Iterator[Finding]:
     """
     import cv2
 
-    outline = _outline(valid)
+    outline = find_outline(valid)
     weight = cv2.GaussianBlur(valid.astype(np.float64), (0, 0), SMOOTHING_PX)
     blurred = cv2.GaussianBlur(np.where(valid[..., None], normals, 0.0), (0, 0), SMOOTHING_PX)
     normals = unit_vectors(blurred / np.maximum(weight, 1e-6)[..., None], min_length=1e-9)
@@ -49,7 +49,7 @@ def find_axes(normals: Float64Array, valid: BoolArray) -> Iterator[Finding]:
             facing = float(np.mean(turned[..., 2][valid] > 0.0))
             if facing > MIN_FACING:
                 outward = _outward(turned, outline)
-                scores[axes, signs] = _curl(turned, valid), outward
+                scores[axes, signs] = median_curl(turned, valid), outward
     listed = (0, 1, 2), (1.0, 1.0, 1.0)
     hollow = outline is not None and scores.get(listed, (0.0, 1.0))[1] < -MIN_OUTWARD
     candidates = {
@@ -76,11 +76,32 @@ def find_axes(normals: Float64Array, valid: BoolArray) -> Iterator[Finding]:
     else:
         return
     read = _name(*best)
-    remedy = f"read the list as ({', '.join(read)})"
+    remedy = f"read the list as {describe_axes(list_ways(read, valid))}"
     yield Finding("axes of the list", (), evidence, measured, limit, remedy, axes=read)
 
 
-def _name(axes: tuple[int, ...], signs: tuple[float, ...]) -> tuple[str, str, str]:
+def list_ways(axes: Axes, valid: BoolArray) -> list[Axes]:
+    """Return axes, and without an outline (H, W) also those that lead to the hollow twin.
+
+    Examples
+    --------
+    >>> list_ways(("-x", "y", "z"), np.ones((8, 8), bool))
+    [('-x', 'y', 'z'), ('x', '-y', 'z')]
+    """
+    if find_outline(valid) is not None:
+        return [axes]
+    x, y = (one[1:] if one.startswith("-") else f"-{one}" for one in axes[:2])
+    return [axes, (x, y, axes[2])]
+
+
+def describe_axes(ways: Sequence[Axes]) -> str:
+    """Return the axes of `list_ways` as a message has them."""
+    shown = " or ".join(f"({', '.join(way)})" for way in ways)
+    twin = ": without an outline, a surface and its hollow twin look alike"
+    return shown + twin * (len(ways) > 1)
+
+
+def _name(axes: tuple[int, ...], signs: tuple[float, ...]) -> Axes:
     """Return how rows are to be read, such as ("x", "-y", "z")."""
     x, y, z = (
         f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(axes, signs, strict=True)
@@ -88,7 +109,7 @@ def _name(axes: tuple[int, ...], signs: tuple[float, ...]) -> tuple[str, str, st
     return x, y, z
 
 
-def _curl(normals: Float64Array, valid: BoolArray) -> float:
+def median_curl(normals: Float64Array, valid: BoolArray) -> float:
     """Return the median absolute curl of the slopes."""
     good = valid & (normals[..., 2] > MIN_Z)
     z = np.maximum(normals[..., 2], MIN_Z)
@@ -98,7 +119,7 @@ def _curl(normals: Float64Array, valid: BoolArray) -> float:
     return float(np.median(curl[inner])) if np.count_nonzero(inner) > 20 else float("inf")
 
 
-def _outline(valid: BoolArray) -> tuple[BoolArray, Float64Array] | None:
+def find_outline(valid: BoolArray) -> tuple[BoolArray, Float64Array] | None:
     """Return pixels along the outline and directions out of the object; None: it has none."""
     import cv2
 

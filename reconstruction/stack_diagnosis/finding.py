@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
+
+Axes: TypeAlias = tuple[str, str, str]
+"""Components of a row as x, y and z, such as ("-x", "y", "z")."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +28,7 @@ class Finding:
     order
         Row of the list for each image, if the finding proposes another order.
     axes
-        Components of a row as x, y and z, such as ("-x", "y", "z"), if the finding proposes others.
+        Components of a row, if the finding proposes others.
     """
 
     fault: str
@@ -35,7 +38,7 @@ class Finding:
     limit: float
     remedy: str
     order: tuple[int, ...] | None = None
-    axes: tuple[str, str, str] | None = None
+    axes: Axes | None = None
 
     @property
     def ratio_to_limit(self) -> float:

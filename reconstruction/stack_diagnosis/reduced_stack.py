@@ -12,6 +12,8 @@ from reconstruction.arrays import BoolArray, Float64Array
 
 MAX_SIDE_PX = 160
 """Images are reduced to this size: faults of lights are in all pixels."""
+SMOOTHING_PX = 1.5
+"""Standard deviation of the filter that lowers noise before images are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,3 +52,12 @@ def reduce_stack(
         unusable.append(1.0 - float(kept[inside].mean()) if inside.any() else 1.0)
     whole = np.asarray(blocks(inside).all(axis=(1, 3)))
     return ReducedStack(means, good, whole, step), np.array(unusable)
+
+
+def smooth_inside(image: Float64Array, inside: BoolArray) -> Float64Array:
+    """Blur an image (H, W) by `SMOOTHING_PX` without the light of pixels that are not inside."""
+    import cv2
+
+    weight = cv2.GaussianBlur(inside.astype(np.float64), (0, 0), SMOOTHING_PX)
+    blurred = cv2.GaussianBlur(np.where(inside, image, 0.0), (0, 0), SMOOTHING_PX)
+    return np.asarray(blurred / np.maximum(weight, 1e-6), np.float64)

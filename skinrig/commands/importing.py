@@ -1,7 +1,7 @@
 """`skinrig import`: sessions from photographs, meshes and light lists."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,7 +17,10 @@ from skinrig.command_line.options import (
     command,
 )
 from skinrig.console import Console, format_count, select_attributes
-from skinrig.next_steps import shell_quote
+from skinrig.next_steps import DEFAULT_WANTS, shell_quote
+
+if TYPE_CHECKING:
+    from reconstruction.pipeline.diagnosed_images import DiagnosedImages
 
 import_app = typer.Typer(
     cls=ImportCommands, help="Import data of other devices.", no_args_is_help=True
@@ -41,12 +44,15 @@ def import_photos(
 ) -> None:
     """Convert RAW, TIFF, EXR, PNG or JPEG photographs to a session.
 
+    Files whose names differ only by "parallel" and "crossed" are polarized pairs: faults that
+    the two images show are printed.
+
     Example: skinrig import photos portraits --out session-portraits
 
     Parameters
     ----------
     directory
-        Folder of photographs, or one file.
+        Folder of photographs, one file, or a video, whose frames are read.
     rig
         Rig whose camera took the photographs, so that its calibrations apply; default: none.
     target
@@ -61,25 +67,35 @@ def import_photos(
     """
     from capture.importers import import_photos as bring_in
     from capture.importers.framing import Framing
+    from capture.importers.video_frames import open_source
     from capture.rig import load_rig
     from skinrig.consent import parse_subject
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    done = bring_in(
-        directory,
-        out=out,
-        rig=None if rig is None else load_rig(rig),
-        kind="chart" if target else "subject",
-        subject=person,
-        framing=Framing.parse(crop, width),
-    )
+    with open_source(directory) as source:
+        done = bring_in(
+            source.path,
+            out=out,
+            rig=None if rig is None else load_rig(rig),
+            kind="chart" if target else "subject",
+            subject=person,
+            framing=Framing.parse(crop, width),
+            assumed=source.assumed,
+        )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
     place = shell_quote(out)
+    findings = []
+    if done.has_pairs and not target:
+        from reconstruction.pipeline import recipes
+
+        found = recipes.diagnose(out)
+        _print_findings(console, found)
+        findings = found.to_json()["findings"]
     if target:
         after = f"calibrate color {place} --out calibration"
     elif done.color_states:
@@ -92,7 +108,8 @@ def import_photos(
     console.print_line(f"next: skinrig {after}")
     console.print_document(
         "skinrig.import/1",
-        select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
+        select_attributes(done, "path", "frames", "assumed", "states", "ignored")
+        | {"findings": findings},
     )
 
 
@@ -204,7 +221,7 @@ def import_olat(
     Parameters
     ----------
     directory
-        Folder of images, one per light.
+        Folder of images, or a video, one per light.
     lights
         Light list: .lp, text, JSON or NumPy file, or folder of a chrome ball's images; estimate:
         from the images alone; default: found in the folder.
@@ -221,30 +238,33 @@ def import_olat(
         Pseudonym of the subject; none: a thing, which needs no consent.
     """
     from capture.importers import import_light_list
+    from capture.importers.video_frames import open_source
     from skinrig.consent import parse_subject
-    from skinrig.importing.light_stacks import find_lights
+    from skinrig.importing.light_stacks import find_lights, require_list_of_video
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    found = find_lights(
-        directory,
-        lights=lights,
-        mask=mask,
-        encoding=encoding,  # type: ignore[arg-type]
-        camera=camera,
-        mm_per_px=mm_per_px,
-    )
-    done = import_light_list(
-        directory,
-        out=out,
-        lights=found.lights,
-        mask=mask,
-        encoding=encoding,  # type: ignore[arg-type]
-        resolved_encoding=found.encoding,
-        mm_per_px=mm_per_px,
-        subject=person,
-        assumed=found.assumed,
-    )
+    require_list_of_video(directory, lights)
+    with open_source(directory) as source:
+        found = find_lights(
+            source.path,
+            lights=lights,
+            mask=mask,
+            encoding=encoding,  # type: ignore[arg-type]
+            camera=camera,
+            mm_per_px=mm_per_px,
+        )
+        done = import_light_list(
+            source.path,
+            out=out,
+            lights=found.lights,
+            mask=mask,
+            encoding=encoding,  # type: ignore[arg-type]
+            resolved_encoding=found.encoding,
+            mm_per_px=mm_per_px,
+            subject=person,
+            assumed=(*source.assumed, *found.assumed),
+        )
     console.print_each("assumed", done.assumed)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
@@ -265,61 +285,56 @@ def diagnose(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Find what is wrong with images under listed lights; exit code 1 if anything is.
+    """Find what is wrong with a session's images; exit code 1 if anything is.
 
-    The images themselves show it: light lists in another order, swapped or wrong lights, flipped
-    axes, a wrong transfer curve, ambient light, near lights, drift, and empty, repeated, moved or
-    clipped images. `reconstruct` uses the order and leaves out the images that this command names.
+    The images themselves show it. Under listed lights: lists in another order, swapped or wrong
+    lights, flipped axes, a wrong transfer curve, ambient light, near lights, drift, and empty,
+    repeated, moved or clipped images. Of polarized pairs: exchanged or unequally exposed images. Of
+    gradient patterns: exchanged, missing, empty or inconsistent images. `reconstruct` uses the
+    order and leaves out the images that this command names; its maps name all other faults.
 
     Example: skinrig diagnose session-rti --out diagnosis.html
 
     Parameters
     ----------
     session
-        Session of `skinrig import olat`.
+        Session of `skinrig import olat`, of the gradient rig, or with polarized pairs.
     out
         HTML file that shows the images in question, with balls under their lights.
     """
-    from reconstruction.pipeline.light_stack import diagnose_images
+    from reconstruction.pipeline import recipes
 
     console = Console(json)
-    console.progress("read the images and compare them with their light list")
-    stack = diagnose_images(session)
-    found = stack.diagnosis
+    console.progress("read the images and compare them with each other")
+    found = recipes.diagnose(session)
+    console.print_each("assumed", found.assumed)
+    if not _print_findings(console, found):
+        console.print_line(f"{session}: no fault was found in {len(found.names)} images")
+    if out is not None:
+        from skinrig.atomic_file import write_atomically
+        from skinrig.reporting.diagnosis_page import build_diagnosis_page
+
+        write_atomically(out, build_diagnosis_page(str(session), found))
+        console.print_line(f"{out}: open it in a browser")
+    maps = recipes.list_maps(session)
+    usual = (names for names in DEFAULT_WANTS.values() if set(names.split(",")) <= set(maps))
+    wanted = next(usual, ",".join(maps[:2]))
+    after = f"reconstruct {shell_quote(session)} --maps {wanted} --out appearance"
+    console.print_line(f"next: skinrig {after}")
+    console.print_document(
+        "skinrig.diagnosis/1", {"page": out, "session": session} | found.to_json()
+    )
+    if found.findings:
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
+
+
+def _print_findings(console: Console, found: "DiagnosedImages") -> bool:
+    """Print a table of faults; return whether there are any."""
     rows = [
-        (
-            one.fault,
-            ", ".join(str(number + 1) for number in one.frames) or "all",
-            one.ratio_to_limit,
-            one.evidence,
-            one.remedy,
-        )
+        (one.fault, found.name_images(one), one.ratio_to_limit, one.evidence, one.remedy)
         for one in found.findings
     ]
     if rows:
         head = ("fault", "images", "over its limit", "evidence", "remedy")
         console.print_table(head, rows)
-    else:
-        console.print_line(f"{session}: no fault was found in {len(found.order)} images")
-    if out is not None:
-        from skinrig.atomic_file import write_atomically
-        from skinrig.reporting.diagnosis_page import build_diagnosis_page
-
-        write_atomically(out, build_diagnosis_page(str(session), stack))
-        console.print_line(f"{out}: open it in a browser")
-    after = f"reconstruct {shell_quote(session)} --maps normals,albedo --out appearance"
-    console.print_line(f"next: skinrig {after}")
-    console.print_document(
-        "skinrig.diagnosis/1",
-        {
-            "page": out,
-            "session": session,
-            "findings": [one.to_json() for one in found.findings],
-            "order": [int(number) + 1 for number in found.order],
-            "left_out": [int(number) + 1 for number in found.left_out.nonzero()[0]],
-            "directions": found.directions,
-            "strength": found.strength,
-        },
-    )
-    if rows:
-        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
+    return bool(rows)

@@ -10,7 +10,6 @@ import numpy as np
 
 from capture.documents import Fault, InputError
 from capture.importers.camera_poses import read_camera_axes
-from capture.importers.image_checks import VIDEO_SUFFIXES, advise_conversion
 from capture.importers.image_stacks import LINEAR_MISFIT_RATIO, Encoding, encode_srgb
 from capture.importers.images import read_photo
 from capture.importers.imported_session import find_common_white
@@ -24,6 +23,7 @@ from capture.importers.light_lists import (
     to_gray,
 )
 from capture.importers.light_tables import LightListError, UnequalCountError
+from capture.importers.video_frames import is_video
 from model.arrays import BoolArray, Float64Array
 
 if TYPE_CHECKING:
@@ -121,12 +121,23 @@ def find_lights(
     return replace(found, lights=turned, assumed=(*found.assumed, text))
 
 
+def require_list_of_video(source: Path, lights: str | None) -> None:
+    """Refuse a video without a list of its lights: the folder of its frames has none.
+
+    Raises
+    ------
+    LightListError
+        With what to do.
+    """
+    if lights is None and is_video(source):
+        raise LightListError.at(
+            "needs a list of its lights", "lights", "none", f"a file, or {ESTIMATE_LIGHTS}",
+            where=source, advice=f"Give --lights FILE, or --lights {ESTIMATE_LIGHTS}.",
+        )  # fmt: skip
+
+
 def _require_images(directory: Path) -> None:
-    """Refuse a video, and folders of several cameras, with what to do."""
-    if directory.is_file() and directory.suffix.lower() in VIDEO_SUFFIXES:
-        raise LightListError(
-            "is a video", where=str(directory), advice=advise_conversion(directory.name)
-        )
+    """Refuse folders of several cameras, with what to do."""
     if directory.is_dir():
         try:
             find_images(directory)

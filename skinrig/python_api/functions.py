@@ -254,22 +254,23 @@ def reconstruct(
 
 
 def diagnose(session: FolderLike) -> DiagnosedSession:
-    """Find what is wrong with images under listed lights.
+    """Find what is wrong with images under listed lights, polarized pairs or gradient patterns.
 
     Parameters
     ----------
     session
-        Session of `load_session` from an array, or of `skinrig import olat`.
+        Session of `load_session` from an array, of `skinrig import`, or of the flash or gradient
+        rig.
 
     Raises
     ------
     ValueError
-        If the session has no light list.
+        If the session has no such images.
     """
-    from reconstruction.pipeline.light_stack import diagnose_session
+    from reconstruction.pipeline.recipes import diagnose as find_faults
 
     path = to_path(session)
-    return DiagnosedSession(path, diagnose_session(path))
+    return DiagnosedSession(path, find_faults(path))
 
 
 def plan(rig: str, goals: str = "", *, out: str | Path = "plan.json", **options: Any) -> ChosenPlan:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from capture.session import FrameRecord, Session
     from model.skin import SkinAppearance
-    from reconstruction.stack_diagnosis import Diagnosis
+    from reconstruction.pipeline.diagnosed_images import DiagnosedImages
     from skinrig.calibrating.calibrate import SavedCalibration
     from skinrig.exporting.sealing import ExportResult
     from skinrig.planning.plans import PlanChoice
@@ -217,29 +217,30 @@ class MapsFolder(NotebookResult):
 
 @dataclass(frozen=True)
 class DiagnosedSession(NotebookResult):
-    """What the images of a session show about their light list.
+    """What the images of a session show about themselves and their light list.
 
     Attributes
     ----------
     path
         SESSION/ folder.
     found
-        Findings with images, evidence and remedy; the order of the images and their directions.
+        Findings with images, evidence and remedy; names of the images; of a light list also the
+        order of the images and their directions.
     """
 
-    found: Diagnosis
+    found: DiagnosedImages
 
     def blocks(self) -> Iterator[Block]:
         """Yield the findings."""
         from skinrig.reporting import page
 
         if not self.found.findings:
-            yield page.Paragraph(f"No fault was found in {len(self.found.order)} images.")
+            yield page.Paragraph(f"No fault was found in {len(self.found.names)} images.")
             return
         rows = [
             (
                 one.fault,
-                ", ".join(str(number + 1) for number in one.frames) or "all",
+                self.found.name_images(one),
                 page.format_number(one.ratio_to_limit),
                 one.evidence,
                 one.remedy,

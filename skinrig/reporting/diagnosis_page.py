@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Float64Array
-from reconstruction.pipeline.light_stack import DiagnosedStack
-from reconstruction.stack_diagnosis.finding import Finding
+from reconstruction.pipeline.diagnosed_images import DiagnosedImages
+from skinrig.console import format_count
 from skinrig.reporting import page
 from skinrig.reporting.map_images import draw_plain_image, shrink
 
@@ -24,11 +24,11 @@ BALL_RADIUS = 0.92
 """Of half the image's width."""
 
 
-def build_diagnosis_page(name: str, found: DiagnosedStack) -> str:
+def build_diagnosis_page(name: str, found: DiagnosedImages) -> str:
     """Return the page as HTML.
 
-    Each image in question has a matte ball under the light that the list gives it. If the image
-    itself shows another light, a second ball is lit by that.
+    Each image in question of a light list has a matte ball under the light that the list gives it.
+    If the image itself shows another light, a second ball is lit by that.
 
     Parameters
     ----------
@@ -37,38 +37,45 @@ def build_diagnosis_page(name: str, found: DiagnosedStack) -> str:
     found
         Diagnosis with the images.
     """
-    findings = found.diagnosis.findings
-    count = len(found.gray)
-    verdict = (
-        f"{len(findings)} faults in {count} images" if findings else f"no fault in {count} images"
-    )
+    count = len(found.names)
+    faults = found.findings
+    verdict = f"{format_count(len(faults), 'fault')} in {count} images"
+    if not faults:
+        verdict = f"no fault in {count} images"
     lead: list[page.Block] = [page.Paragraph(f"{verdict}.")]
     rows = [
-        (one.fault, _list_images(one), one.ratio_to_limit, one.evidence, one.remedy)
-        for one in findings
+        (one.fault, found.name_images(one), one.ratio_to_limit, one.evidence, one.remedy)
+        for one in faults
     ]
     if rows:
         head = ("fault", "images", "over its limit", "evidence", "remedy")
         lead.append(page.build_table(head, rows, caption="The most certain fault comes first"))
+    if found.assumed:
+        lead.append(page.Bullets([f"assumed: {text}" for text in found.assumed]))
     return page.render_page(f"diagnosis of {Path(name).name}", lead, _sections(found))
 
 
-def _list_images(one: Finding) -> str:
-    return ", ".join(str(number + 1) for number in one.frames) or "all"
-
-
-def _sections(found: DiagnosedStack) -> Iterator[page.Block]:
-    step = max(1, max(found.gray.shape[1:]) // IMAGE_WIDTH_PX)  # the stack may lie in a file
-    level = float(np.quantile(found.gray[:, ::step, ::step], 0.999)) or 1.0
-    for one in found.diagnosis.findings:
+def _sections(found: DiagnosedImages) -> Iterator[page.Block]:
+    count = len(found.names)
+    level = _find_level(found)
+    for one in found.findings:
         yield page.Heading(one.fault, 2)
         yield page.Paragraph(f"{one.evidence}. Remedy: {one.remedy}.")
-        numbers = list(one.frames) or list(range(0, len(found.gray), _step(len(found.gray))))
-        for number in numbers[:MAX_SHOWN]:
-            yield page.Images(_draw_image(found, number, level))
+        numbers = list(one.frames) or list(range(0, count, _step(count)))
+        shown = [_draw_image(found, number, level) for number in numbers[:MAX_SHOWN]]
+        if found.diagnosis is None:  # side by side: each is one image
+            shown = [[image for images in shown for image in images]]
+        for images in shown:
+            yield page.Images(images)
         left = len(numbers) - MAX_SHOWN
         if left > 0 and one.frames:
             yield page.build_note(f"{left} more images have this fault.")
+
+
+def _find_level(found: DiagnosedImages) -> float:
+    """Return the light that is shown as white; images may lie in a file."""
+    step = max(1, max(found.gray[0].shape) // IMAGE_WIDTH_PX)
+    return float(max(np.quantile(one[::step, ::step], 0.999) for one in found.gray)) or 1.0
 
 
 def _step(count: int) -> int:
@@ -76,12 +83,15 @@ def _step(count: int) -> int:
     return max(1, -(-count // MAX_SHOWN))
 
 
-def _draw_image(found: DiagnosedStack, number: int, level: float) -> list[page.Image]:
+def _draw_image(found: DiagnosedImages, number: int, level: float) -> list[page.Image]:
     """Return an image, the ball under its listed light, and one under another light it shows."""
     small = shrink(np.asarray(found.gray[number]) / level, IMAGE_WIDTH_PX)
-    shown = draw_plain_image(f"image {number + 1}", _encode(small))
+    name = found.names[number]
+    if found.diagnosis is None or found.listed is None:
+        return [draw_plain_image(name, _encode(small))]
+    shown = draw_plain_image(f"image {name}", _encode(small))
     listed = _encode(_shade_ball(found.listed[number]))
-    which = f"of image {number + 1}"
+    which = f"of image {name}"
     images = [
         shown,
         draw_plain_image("light of the list", listed, alt=f"ball under the listed light {which}"),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.stack_diagnosis import pattern_faults
+from reconstruction.stack_diagnosis.polarized_pairs import find_pair_faults
 
 FEW = settings(derandomize=True, deadline=None, max_examples=8, database=None)
 VERY_FEW = settings(FEW, max_examples=3)
@@ -17,13 +18,25 @@ TONE = st.sampled_from(sorted(TONES))
 
 
 @FEW
-@given(seed=SEED, tone=TONE, unit=st.sampled_from([1e-6, 1.0, 1e6]))
-def test_exchanged_pair_is_found_in_any_unit(seed, tone, unit):
-    parallel, crossed, inside = make_pair("", seed, tone=tone, side=48)
+@given(seed=SEED, tone=TONE, unit=st.sampled_from([1e-6, 1.0, 1e6]), gray=st.booleans())
+def test_exchanged_pair_is_found_in_any_unit(seed, tone, unit, gray):
+    parallel, crossed, inside = make_pair("", seed, tone=tone, side=48, gray=gray)
     parallel, crossed = unit * parallel, unit * crossed
-    assert not list(pattern_faults.find_exchanged_pair(parallel, crossed, inside))
-    (one,) = pattern_faults.find_exchanged_pair(crossed, parallel, inside)
-    assert (one.fault, one.frames) == ("exchanged polarizers", (0, 1))
+    assert not list(find_pair_faults(parallel, crossed, inside))
+    highlights = np.quantile((parallel - crossed)[inside], 0.99) / np.quantile(
+        parallel[inside], 0.95
+    )
+    found = [one.fault for one in find_pair_faults(crossed, parallel, inside)]
+    assert found == ["exchanged polarizers"] or highlights < 0.1
+
+
+@FEW
+@given(seed=SEED, tone=TONE, ratio=st.sampled_from([0.4, 0.6, 1.7, 3.0]))
+def test_unequal_exposures_of_colored_pair_are_measured(seed, tone, ratio):
+    parallel, crossed, inside = make_pair("", seed, tone=tone, side=48)
+    (one,) = find_pair_faults(ratio * parallel, crossed, inside)
+    assert (one.fault, one.frames) == ("unequal exposures", (0, 1))
+    np.testing.assert_allclose(np.exp(one.measured), max(ratio, 1 / ratio), rtol=0.12)
 
 
 @pytest.mark.parametrize("fault", [one for one in PATTERN_FAULTS if one != "x and -x"])
@@ -60,4 +73,4 @@ def test_unknown_pattern_or_shape_is_refused():
     with pytest.raises(PhotometricStereoError, match="images: got 'w'"):
         list(pattern_faults.find_pattern_faults({"w": image}, inside))
     with pytest.raises(PhotometricStereoError, match="crossed"):
-        list(pattern_faults.find_exchanged_pair(image, image[:4], inside))
+        list(find_pair_faults(image, image[:4], inside))

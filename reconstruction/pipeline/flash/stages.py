@@ -32,7 +32,9 @@ from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.face_light import FaceLight, estimate_face_light
 from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.diagnosed_images import collect_images
 from reconstruction.pipeline.flash import oxygenation
+from reconstruction.pipeline.flash.pair_diagnosis import diagnose_pair
 from reconstruction.pipeline.flash.skin_stage import find_imported_face, skin_stage
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
@@ -214,7 +216,19 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
         raise InputsError(
             f"{session.path}: has no {what} of state {state!r}; it has {there} [SR-REC-001]"
         )
+    _diagnose(rig, images["parallel"], images["crossed"])
     return images
+
+
+def _diagnose(rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage) -> None:
+    """Record faults of a pair of images of one size."""
+    groups = []
+    if parallel is not None and parallel.rgb.shape == crossed.rgb.shape:
+        usable = parallel.valid & crossed.valid
+        neutral = rig.session.read(rig.session.frames("subject", state=rig.inputs.state)[0]).neutral
+        names = [f"{rig.inputs.state} {polarizer}" for polarizer in ("parallel", "crossed")]
+        groups.append(diagnose_pair(parallel.rgb, crossed.rgb, usable, neutral, names))
+    collect_images(groups).record_in(rig.inputs)
 
 
 def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:

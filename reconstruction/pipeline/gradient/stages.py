@@ -34,6 +34,7 @@ from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.gradient.images import GradientImages, SkinState, StatePatterns
+from reconstruction.pipeline.gradient.pattern_diagnosis import diagnose_states
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
     common_skin,
@@ -47,7 +48,7 @@ from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 _log = logging.getLogger(__name__)
 
-STAGE_REVISION = 12
+STAGE_REVISION = 13
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -55,6 +56,8 @@ MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histo
 STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE = "strain.json", "histograms.json", "kernels.json"
 FILE_NAMES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
+DIAGNOSED = "_diagnosed"
+"""Product of the stage that judges the patterns before any map is made of them."""
 CUTOFF_UM = 1000.0
 """Longest wavelength of the surface topography (Nagano et al. 2015, section 4)."""
 SMOOTH_PX = 1.0
@@ -124,10 +127,12 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     noises = " ".join(f"_slope_noise_{state.name}" for state in rig.images.states)
     diffuse, counted = f"diffuse_normals_{neutral}", f"{HISTOGRAM_FILE} _histograms"
     kernels = partial(_kernels, inputs, rig)
+    strain, facets = partial(_strain, inputs, rig), partial(_facets, inputs, rig)
     made = [
-        stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, inputs, rig)),
-        stage("facets", "", "_facets", partial(_facets, inputs, rig)),
-        stage(f"diffuse normals {neutral}", "", diffuse, partial(_diffuse, rig)),
+        stage("diagnosis", "", DIAGNOSED, partial(_diagnose, inputs, rig)),
+        stage("strain", DIAGNOSED, f"_strains {STRAIN_FILE}", _diagnosed(strain)),
+        stage("facets", DIAGNOSED, "_facets", _diagnosed(facets)),
+        stage(f"diffuse normals {neutral}", DIAGNOSED, diffuse, _diagnosed(partial(_diffuse, rig))),
         stage(
             "histograms", f"_strains _facets {heights} {noises}", counted, partial(_histograms, rig)
         ),
@@ -136,8 +141,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     for state in rig.images.states:
         name, restored = state.name, f"_restored_{state.name}"
         normals, height = partial(_normals, rig, state), partial(_height, rig, state)
+        crossed = partial(_crossed, rig, state)
         made += [
-            stage(f"crossed {name}", "", f"crossed_{name}", partial(_crossed, rig, state)),
+            stage(f"crossed {name}", DIAGNOSED, f"crossed_{name}", _diagnosed(crossed)),
             stage(f"normals {name}", "_facets", f"normals_{name} {restored}", normals),
             stage(f"height {name}", restored, f"height_{name} _slope_noise_{name}", height),
         ]
@@ -205,6 +211,22 @@ def _lights(inputs: Inputs, serial: str) -> SphereLights:
         intensity_stderr=table.intensities_stderr,
         leakage_stderr=leakage_stderr,
     )
+
+
+def _diagnose(inputs: Inputs, rig: GradientRig) -> bool:
+    """Record the faults of the patterns; return whether any was found."""
+    found = diagnose_states(rig.images, inputs.session)
+    found.record_in(inputs)
+    return bool(found.findings)
+
+
+def _diagnosed(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a stage's function that runs after the diagnosis, which marks its maps."""
+
+    def run_after(**made: Any) -> Any:
+        return run(**{name: value for name, value in made.items() if name != DIAGNOSED})
+
+    return run_after
 
 
 def _strain(inputs: Inputs, rig: GradientRig) -> Mapping[str, Any]:

@@ -1,15 +1,18 @@
 """Write a mesh with its material and blend shapes as a binary glTF 2.0 file.
 
 As the standard requires, lengths are in meters and v increases downwards. glTF has no subsurface
-scattering; sigma_tr is written to ``extras``.
+scattering; sigma_tr is written to ``extras``, and a variant of the material transmits light through
+the body. Programs without the extension of diffuse transmission show the other materials, whose
+base color is complete.
 
 References
 ----------
 glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_specular,
-KHR_materials_variants.
+KHR_materials_variants; see `skinrig.exporting.materials.diffuse_transmission` for the variant.
 """
 
 import copy
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -28,6 +31,11 @@ from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
+from skinrig.exporting.materials.diffuse_transmission import (
+    EXTENSIONS,
+    DiffuseTransmission,
+    amplitude,
+)
 from skinrig.exporting.materials.expression_normals import (
     NEUTRAL_VARIANT,
     VARIANT_NOTE,
@@ -41,7 +49,11 @@ GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
 VARIANTS_EXTENSION: Final = "KHR_materials_variants"
 N_NEUTRAL_TEXTURES: Final = 4
-"""Textures of the neutral material; those of expressions follow."""
+"""Textures of the neutral material; the base color of the translucent variant follows, then the
+normals of expressions."""
+TRANSLUCENT_VARIANT: Final = "translucent"
+BRIGHT_QUANTILE: Final = 0.999
+"""Texels up to this quantile keep their reflectance in the translucent variant."""
 
 
 @dataclass(slots=True)
@@ -140,17 +152,52 @@ def write(
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports have 16",
             "morph_targets": list(material.shapes),
-            "variants": dict.fromkeys(variants, VARIANT_NOTE),
+            "variants": {TRANSLUCENT_VARIANT: TRANSLUCENT_NOTE}
+            | dict.fromkeys(variants, VARIANT_NOTE),
+            "transmission": describe_transmission(material),
         },
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
     left_out = material.list_mesh_omissions(delivery)
-    left_out.append(("subsurface light", f"not part of glTF: {in_blender}"))
+    why = f"glTF spreads no light sideways; the variant {TRANSLUCENT_VARIANT} transmits it"
+    left_out.append(("subsurface light", f"{why}: {in_blender}"))
     if not material.shapes:
         left_out.append(
             ("morph targets", "the mesh has no blend shapes; give one that has with --mesh")
         )
     return left_out
+
+
+TRANSLUCENT_NOTE: Final = (
+    "light through the body by KHR_materials_diffuse_transmission; the base color is divided by "
+    "the part that is not transmitted"
+)
+
+
+def find_transmission(material: Material) -> DiffuseTransmission:
+    """Return the transmission of the median medium of a material's valid texels."""
+    on = material.valid if material.valid.any() else np.ones_like(material.valid)
+    brightest = float(np.quantile(material.base_color[on].max(axis=-1), BRIGHT_QUANTILE))
+    return DiffuseTransmission.of(
+        np.median(material.translucency_mm[on], axis=0),
+        np.median(material.deficit[on], axis=0),
+        eta=material.eta,
+        max_factor=float(np.clip(1.0 - brightest, 0.0, 1.0)),
+        thickness_m=float(np.ptp(material.mesh.vertices_mm[:, 2])) * M_PER_MM,
+    )
+
+
+def describe_transmission(material: Material) -> dict[str, Any]:
+    """Return the transmission as JSON values, with the part of the light that it keeps."""
+    made = find_transmission(material)
+    on = material.valid if material.valid.any() else np.ones_like(material.valid)
+    whole = amplitude(np.median(material.deficit[on], axis=0), material.eta)
+    return {
+        "extensions": made.extensions(),
+        "kept_fraction": (made.factor * made.color / whole).tolist(),
+        "translucency_mm": made.translucency_mm.tolist(),
+        "channels": "red, green, blue; medium of the median over the valid texels",
+    }
 
 
 def encode_glb(
@@ -167,7 +214,7 @@ def encode_glb(
     provenance
         Source, inputs, versions, assumptions and consent, for the file's ``asset.extras``.
     variants
-        Tangent-space normals by expression, as variants of the material.
+        Tangent-space normals by expression, as variants of the material; one more is translucent.
     """
     mesh = material.mesh
     skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
@@ -195,12 +242,12 @@ def encode_glb(
     surface = pygltflib.Primitive(
         attributes=attributes, indices=indices, material=0, targets=targets
     )
-    if variants:
-        _add_variants(file, surface, list(variants))
+    transmission = find_transmission(material)
+    _add_variants(file, surface, list(variants), transmission)
     extras = {"targetNames": list(material.shapes)} if targets else {}
     named: dict[str, Any] = {"name": "skin", "extras": extras}
     file.meshes = [pygltflib.Mesh(primitives=[surface], weights=[0.0] * len(targets), **named)]
-    for source, (name, data) in enumerate(_pictures(material, variants)):
+    for source, (name, data) in enumerate(_pictures(material, variants, transmission)):
         file.images.append(
             pygltflib.Image(mimeType="image/png", bufferView=binary.view(data), name=name)
         )
@@ -211,22 +258,34 @@ def encode_glb(
     return b"".join(file.save_to_bytes())
 
 
-def _add_variants(file: pygltflib.GLTF2, surface: pygltflib.Primitive, names: list[str]) -> None:
-    """Add one material per expression, with the normal texture after the neutral textures."""
+def _add_variants(
+    file: pygltflib.GLTF2,
+    surface: pygltflib.Primitive,
+    expressions: list[str],
+    transmission: DiffuseTransmission,
+) -> None:
+    """Add the translucent material, and one per expression with its own normal texture."""
     neutral = file.materials[0]
-    for number, name in enumerate(names):
+    clear = copy.deepcopy(neutral)
+    clear.name = f"{neutral.name}, {TRANSLUCENT_VARIANT}"
+    clear.pbrMetallicRoughness.baseColorTexture.index = N_NEUTRAL_TEXTURES
+    clear.extensions |= transmission.extensions()
+    file.materials.append(clear)
+    for number, name in enumerate(expressions, N_NEUTRAL_TEXTURES + 1):
         own = copy.deepcopy(neutral)
         own.name = f"{neutral.name}, {name}"
-        own.normalTexture.index = N_NEUTRAL_TEXTURES + number
+        own.normalTexture.index = number
         file.materials.append(own)
-    every = [NEUTRAL_VARIANT, *names]
+    every = [NEUTRAL_VARIANT, TRANSLUCENT_VARIANT, *expressions]
     mappings = [{"material": k, "variants": [k]} for k in range(len(every))]
     surface.extensions = {VARIANTS_EXTENSION: {"mappings": mappings}}
     file.extensions = {VARIANTS_EXTENSION: {"variants": [{"name": name} for name in every]}}
-    file.extensionsUsed = [*file.extensionsUsed, VARIANTS_EXTENSION]
+    file.extensionsUsed = [*file.extensionsUsed, VARIANTS_EXTENSION, *EXTENSIONS]
 
 
-def _pictures(material: Material, variants: Mapping[str, Float32Array]) -> list[tuple[str, bytes]]:
+def _pictures(
+    material: Material, variants: Mapping[str, Float32Array], transmission: DiffuseTransmission
+) -> list[tuple[str, bytes]]:
     """Return names and 8-bit PNG files of the textures, in the order of their indices."""
 
     def codes(name: str) -> NDArray[Any]:
@@ -240,6 +299,9 @@ def _pictures(material: Material, variants: Mapping[str, Float32Array]) -> list[
         "normal": codes("normal"),
         "specular in A": np.stack([white, white, white, weight], axis=-1),
     }
+    brighter = material.base_color / np.float32(1.0 - transmission.factor)
+    image = dataclasses.replace(material.image("base_color", ExportSettings()), values=brighter)
+    pictures[f"base_color, {TRANSLUCENT_VARIANT}"] = encode_png_codes(image, depth=8)[0]
     for name, normals in variants.items():
         one = material.normal_image("normal", normals, ExportSettings())
         pictures[f"normal, {name}"] = encode_png_codes(one, depth=8)[0]

@@ -2,6 +2,7 @@ import json
 import os
 import struct
 import zlib
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -142,6 +143,58 @@ def test_a_raw_file_keeps_its_sensor_values(tmp_path):
     assert frame.neutral == pytest.approx((0.5, 1.0, 0.7), abs=1e-4)
     assert frame.camera_serial == ""
     assert frame.captured_at is None
+
+
+def write_foreign_dng(path, rgb, orientation):
+    """Write a DNG of another program: a mosaic whose stored rows are not the upright ones."""
+    stored = {
+        1: rgb, 2: rgb[:, ::-1], 3: rgb[::-1, ::-1], 4: rgb[::-1],
+        5: rgb.transpose(1, 0, 2), 6: np.rot90(rgb),
+        7: rgb[::-1, ::-1].transpose(1, 0, 2), 8: np.rot90(rgb, -1),
+    }[orientation]  # fmt: skip
+    cfa = np.empty((2 * stored.shape[0], 2 * stored.shape[1]), np.uint16)
+    for row, column, channel in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
+        cfa[row::2, column::2] = stored[..., channel]
+    identity = [1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1]
+    tags = [
+        (274, "H", 1, orientation, True), (33421, "H", 2, (2, 2), True),
+        (33422, "B", 4, bytes([0, 1, 1, 2]), True), (50706, "B", 4, b"\1\4\0\0", True),
+        (50708, "s", 0, "Some Camera", True), (50714, "H", 1, 64, True),
+        (50717, "I", 1, 4095, True), (50721, "2i", 9, identity, True),
+        (50728, "2I", 3, [1, 2, 1, 1, 1, 2], True),
+    ]  # fmt: skip
+    tifffile.imwrite(path, cfa, photometric="cfa", extratags=tags, metadata=None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_raw_mosaic_is_turned_upright(orientation, tmp_path):
+    rgb = np.random.default_rng(orientation).integers(100, 4000, (20, 30, 3), dtype=np.uint16)
+    file = tmp_path / "a.dng"
+    write_foreign_dng(file, rgb, orientation)
+    photo = read_photo(file)
+    np.testing.assert_allclose(linear(photo.frame).rgb * (4095 - 64) + 64, rgb, atol=0.01)
+    assert photo.orientation == orientation
+    assert any("EXIF orientation" in note for note in photo.notes) == (orientation != 1)
+    unturned = read_photo(file, turn_raw=False)
+    np.testing.assert_array_equal(unturned.frame.cfa, raw.read(file).cfa)
+    assert unturned.frame.pattern == "RGGB"
+    assert any("not followed" in note for note in unturned.notes) == (orientation != 1)
+
+
+def test_imported_raw_is_upright_unless_rig_is_known(tmp_path):
+    rgb = np.random.default_rng(0).integers(100, 4000, (20, 30, 3), dtype=np.uint16)
+    write_foreign_dng(tmp_path / "a.dng", rgb, 6)
+    import_photos(tmp_path / "a.dng", out=tmp_path / "s", now=clock)
+    session = Session.open(tmp_path / "s")
+    (record,) = session.frames()
+    np.testing.assert_allclose(linear(session.read(record)).rgb * (4095 - 64) + 64, rgb, atol=0.01)
+    view = session.rig.views[0]
+    sensor = replace(view, width_px=40, height_px=60, cfa="RGGB")
+    rig = replace(session.rig, views=(sensor,))
+    done = import_photos(tmp_path / "a.dng", out=tmp_path / "r", rig=rig, now=clock)
+    (record,) = Session.open(tmp_path / "r").frames()
+    assert Session.open(tmp_path / "r").read(record).cfa.shape == (60, 40)
+    assert any("not followed" in text for text in done.assumed)
 
 
 def exif_with_place():

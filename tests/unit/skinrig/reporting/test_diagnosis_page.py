@@ -4,9 +4,15 @@ import numpy as np
 from fixtures.faulty_stacks import make
 
 from model.vectors import unit_vectors
-from reconstruction.pipeline.light_stack import DiagnosedStack
+from reconstruction.pipeline.diagnosed_images import DiagnosedImages
 from reconstruction.stack_diagnosis import diagnose_stack
 from skinrig.reporting.diagnosis_page import build_diagnosis_page
+
+
+def with_images(found, stack):
+    names = tuple(str(number + 1) for number in range(len(stack.images)))
+    listed = unit_vectors(stack.lights)
+    return DiagnosedImages(found.findings, names, stack.images, found, listed)
 
 
 def test_page_shows_named_images_and_both_lights():
@@ -14,9 +20,7 @@ def test_page_shows_named_images_and_both_lights():
     found = diagnose_stack(
         stack.images, stack.lights, inside=stack.inside, rng=np.random.default_rng(0)
     )
-    page = build_diagnosis_page(
-        "a/s", DiagnosedStack(found, stack.images, unit_vectors(stack.lights))
-    )
+    page = build_diagnosis_page("a/s", with_images(found, stack))
     assert "swapped lights" in page
     for number in stack.frames:
         assert f"ball under the listed light of image {number + 1}" in page
@@ -31,5 +35,5 @@ def test_page_without_faults_names_number_of_images():
         stack.images, stack.lights, inside=stack.inside, rng=np.random.default_rng(0)
     )
     sound = type(found)((), found.order, found.left_out, found.directions, found.strength)
-    images = DiagnosedStack(sound, stack.images, unit_vectors(stack.lights))
-    assert f"no fault in {len(stack.images)} images" in build_diagnosis_page("s", images)
+    page = build_diagnosis_page("s", with_images(sound, stack))
+    assert f"no fault in {len(stack.images)} images" in page
