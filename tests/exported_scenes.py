@@ -1,4 +1,4 @@
-"""Render exported scenes of Mitsuba in new processes, and compare block sums of their images."""
+"""Render exported scenes of Mitsuba in processes of their own, and compare block sums of images."""
 
 import json
 import math
@@ -23,41 +23,71 @@ import json
 import sys
 import numpy as np
 import mitsuba as mi
-mi.set_variant(sys.argv[1])
-if sys.argv[6]:
-    sys.path.insert(0, sys.argv[6])
+variant, plugins = sys.argv[1:]
+mi.set_variant(variant)
+if plugins:
+    sys.path.insert(0, plugins)
     import rigsim.mitsuba
-scene = mi.load_file(sys.argv[2], light=sys.argv[3], **json.loads(sys.argv[7]))
-sensor, count = int(sys.argv[4]), int(sys.argv[8])
-runs = [mi.render(scene, sensor=sensor, spp={SAMPLES}, seed=k) for k in range(count)]
-np.save(sys.argv[5], np.stack([np.array(mi.TensorXf(run).numpy()) for run in runs]))
-ours = {{name.split(".")[0] for name in sys.modules}} & {{"rigsim", "skinrig"}}
-assert bool(ours) == bool(sys.argv[6])
+for line in sys.stdin:
+    order = json.loads(line)
+    scene = mi.load_file(order["file"], light=order["light"], **order["parameters"])
+    settings = {{"sensor": order["sensor"], "spp": {SAMPLES}}}
+    runs = [mi.render(scene, **settings, seed=k) for k in range(order["runs"])]
+    np.save(order["out"], np.stack([np.array(mi.TensorXf(run).numpy()) for run in runs]))
+    ours = {{name.split(".")[0] for name in sys.modules}} & {{"rigsim", "skinrig"}}
+    assert bool(ours) == bool(plugins)
+    print("rendered", flush=True)
 """
+"""Program that renders the scenes that its input names, one per line."""
+renderers = {}
+"""Running processes by whether they have the project's plugins; their start takes seconds."""
+
+
+def start_renderer(folder, *, with_plugins):
+    choice = choose_variant("rgb")
+    environment = {"DRJIT_LIBLLVM_PATH": choice.library, "HOME": str(folder)}
+    share_kernels(environment)
+    arguments = [choice.name, str(ROOT) if with_plugins else ""]
+    with (folder / "renderer.txt").open("w") as errors:
+        return subprocess.Popen(
+            [sys.executable, "-I", "-c", RENDER, *arguments],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+
+
+def end_renderers():
+    """End the processes that render: each module of tests starts its own."""
+    while renderers:
+        with renderers.popitem()[1][0] as process:
+            process.stdin.close()
 
 
 def render(folder, light, sensor, file="scene-stock.xml", *, is_exact=False, **parameters):
-    """Return images of `RUNS` seeds by a new process, with plugins unless materials are stock.
+    """Return images of `RUNS` seeds by a process with plugins, or without for stock materials.
 
     The image of an exact integrator, which draws nothing at random, stands for all seeds.
     """
-    out = folder / "images.npy"
-    choice = choose_variant("rgb")
-    plugins = "" if "stock" in file else str(ROOT)
-    arguments = [choice.name, str(folder / file), light, str(sensor), str(out), plugins]
-    arguments.append(json.dumps({name: str(value) for name, value in parameters.items()}))
-    arguments.append("1" if is_exact else str(RUNS))
-    environment = {"DRJIT_LIBLLVM_PATH": choice.library, "HOME": str(folder.parent)}
-    share_kernels(environment)
-    done = subprocess.run(
-        [sys.executable, "-I", "-c", RENDER, *arguments],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    images = np.load(out)
+    with_plugins = "stock" not in file
+    if with_plugins not in renderers:
+        made = start_renderer(folder.parent, with_plugins=with_plugins)
+        renderers[with_plugins] = made, folder.parent / "renderer.txt"
+    process, errors = renderers[with_plugins]
+    order = {
+        "file": str(folder / file),
+        "out": str(folder / "images.npy"),
+        "light": light,
+        "sensor": sensor,
+        "runs": 1 if is_exact else RUNS,
+        "parameters": {name: str(value) for name, value in parameters.items()},
+    }
+    process.stdin.write(json.dumps(order) + "\n")
+    process.stdin.flush()
+    assert process.stdout.readline() == "rendered\n", errors.read_text()
+    images = np.load(order["out"])
     return np.broadcast_to(images, (RUNS, *images.shape[1:]))
 
 

@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from exported_scenes import change_map, render, replace_in, sum_blocks, worst_z
+from exported_scenes import change_map, end_renderers, render, replace_in, sum_blocks, worst_z
 
 from capture.session import Session
 from model import spectra
@@ -42,6 +42,13 @@ pytestmark = [pytest.mark.render, pytest.mark.long]
 
 POLARIZERS = ("parallel", "crossed")
 SEED = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ended_renderers():
+    yield
+    end_renderers()
+
 
 # flash rig --------------------------------------------------------------------------------------
 

@@ -85,16 +85,21 @@ def test_layers_reflect_the_same_both_ways():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("preset", "samples"), [("I", 24576), ("VI", 49152)])
-def test_skin_layers_match_photon_walk(preset, samples):
-    """Tolerance: .75 %, three standard errors (.25 %) or more; false alarms below 3e-3."""
+@pytest.mark.parametrize(
+    ("preset", "samples", "photons"), [("I", 12288, 1_000_000), ("VI", 32768, 3_000_000)]
+)
+def test_skin_layers_match_photon_walk(preset, samples, photons):
+    """Tolerance: .75 %, three standard errors (.25 %) or more; false alarms below 3e-3.
+
+    A fifth more blood takes 3 to 4 % of the light; a third of the photons show that.
+    """
     stack = layers(PersonSkin.of_preset(preset), "cheek", "neutral", 540.0)
-    traced = trace_photons(stack, photons=4_000_000, rng=np.random.default_rng(0), threads=2)
+    traced = trace_photons(stack, photons=photons, rng=np.random.default_rng(0), threads=2)
     found = render_reflectance(stack, samples=samples, seed=2)
     assert np.hypot(found.stderr, traced.reflectance_stderr) < 0.0025 * traced.reflectance
     assert found.reflectance == pytest.approx(traced.reflectance, rel=0.0075)
     bloody = layers(PersonSkin.of_preset(preset, blood=1.2), "cheek", "neutral", 540.0)
-    other = trace_photons(bloody, photons=4_000_000, rng=np.random.default_rng(0), threads=2)
+    other = trace_photons(bloody, photons=photons // 3, rng=np.random.default_rng(0), threads=2)
     assert found.reflectance != pytest.approx(other.reflectance, rel=0.0075)
 
 
@@ -191,17 +196,20 @@ def agree(ours, peer):
 
 
 SCENES = {
-    "matched": ({"eta": 1.0}, {"eta": 1.0, "absorption": 1.3}, 1024),
-    "uneven": ({"eta": 1.0, "uneven": True}, {"eta": 1.0, "uneven": False}, 1024),
-    "rough": ({}, {"eta": 1.2}, 2048),
-    "relief": ({"height": 0.1}, {"height": 0.1, "absorption": 1.5}, 2048),
+    "matched": ({"eta": 1.0}, {"eta": 1.0, "absorption": 1.3}, 512),
+    "uneven": ({"eta": 1.0, "uneven": True}, {"eta": 1.0, "uneven": False}, 512),
+    "rough": ({}, {"eta": 1.2}, 1024),
+    "relief": ({"height": 0.1}, {"height": 0.1, "absorption": 1.5}, 1024),
 }
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_voxels_match_volpath_uniquely(name):
-    """False alarms: below 2e-3 by Student's distribution with 11 degrees of freedom or more."""
+    """False alarms: below 2e-3 by Student's distribution with 11 degrees of freedom or more.
+
+    The halves of a wrong scene differ by 10 to 20 %, 10 standard errors in one of them.
+    """
     scene, wrong, samples = SCENES[name]
     peer = halves(samples, integrator="volpath", **scene)
     assert agree(halves(samples // 2, integrator="tissue", **scene), peer)

@@ -7,6 +7,7 @@ reflection equation, with shot and read noise, and read from a session as any ot
 import dataclasses
 import io
 from datetime import UTC, date, datetime
+from functools import cache
 
 import numpy as np
 import pytest
@@ -107,8 +108,10 @@ def entering(cosine):
     return 1.0 - (s * s + p * p) / 2.0
 
 
-def photograph(view, light, intensity, shoot, center_mm):
-    """Return fractions of full scale per second, (H, W, 3)."""
+@cache
+def trace(view, center_mm):
+    """Return which pixels show the ellipsoid, points, normals and ways of their rays."""
+    center_mm = np.array(center_mm)
     right, up, back = (np.array(axis) for axis in view.axes)
     column, row = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
     x = (column - (view.width_px - 1) / 2) / view.focal_px
@@ -124,6 +127,12 @@ def photograph(view, light, intensity, shoot, center_mm):
     point = np.array(view.position_mm) + along[..., None] * way
     normal = (point - center_mm) / AXES_MM**2
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return hit, point, normal, way
+
+
+def photograph(view, light, intensity, shoot, center_mm):
+    """Return fractions of full scale per second, (H, W, 3)."""
+    hit, point, normal, way = trace(view, tuple(center_mm.tolist()))
     to_light = np.array(light.position_mm) - point
     distance = np.linalg.norm(to_light, axis=-1)
     to_light /= distance[..., None]

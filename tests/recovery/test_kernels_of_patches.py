@@ -42,47 +42,43 @@ def blocks_of(rest, strained, sides):
 
 
 @pytest.mark.long
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(900)
 def test_small_patch_kernel_errors_have_nominal_coverage():
-    """Pieces of 0.8 mm against 2.4 mm, compressed and stretched, the same skin in both maps.
+    """Pieces of 0.8 mm against 2.4 mm of 12 skins, compressed or stretched, same skin in both maps.
 
     Rationale: standard errors say what another patch of the same skin and size would show.
     Expected: 60 to 76 % within one, 92 to 98 % within the stated 95 % half width; and closer than
     if both maps were taken for different skin.
-    Tolerance: two deviations of 24 independent pieces; pieces and states of a skin are alike.
+    Tolerance: two deviations of 24 pieces, two of each skin. False alarms by the binomial
+    distribution: 3e-3 for one, 6e-3 for the other, of each parameter.
     """
     grid = {"grid": (ALPHA_GRID[::3], SIGMAS_UM[::3]), "axis": "x", "pixel_um": PIXEL_UM}
     held, held_95, narrower = [], [], []
     for seed in range(520, 532):
         skin = make_micro_skin(SITES[seed % 3], seed=seed, size_mm=3.4)
         rest = shown(stretch_skin(skin, stretch=1.0, angle_deg=0.0), (SIDE, SIDE))
-        for stretch in (0.81, 1.19):
-            state = stretch_skin(skin, stretch=stretch, angle_deg=0.0)
-            sides = float(state.gradient[1, 1]), float(state.gradient[0, 0])
-            moved = shown(state, [round(SIDE * side) for side in sides])
-            told = grid | {"stretch": sides[1], "stretch_across": sides[0]}
-            true = fit_kernel(rest, measure_normals(moved, pixel=PIXEL_UM).histogram, **told)
-            for corner in (0, SIDE - PART):
-                one = rest[corner : corner + PART, corner : corner + PART]
-                rows, columns = (
-                    slice(round(corner * side), round((corner + PART) * side)) for side in sides
-                )
-                other = moved[rows, columns]
-                target = measure_normals(other, pixel=PIXEL_UM)
-                about = {"target_samples": target.effective_samples}
-                fit = fit_kernel(
-                    one,
-                    target.histogram,
-                    target_blocks=blocks_of(one, other, sides),
-                    **told,
-                    **about,
-                )
-                error = np.abs([fit.alpha - true.alpha, fit.sigma_um - true.sigma_um])
-                held.append(error <= [fit.alpha_stderr, fit.sigma_stderr_um])
-                held_95.append(error <= [fit.alpha_95, fit.sigma_95_um])
-                if corner == 0:
-                    alone = fit_kernel(one, target.histogram, **told, **about)
-                    narrower.append(fit.alpha_stderr / alone.alpha_stderr)
+        state = stretch_skin(skin, stretch=(0.81, 1.19)[seed % 2], angle_deg=0.0)
+        sides = float(state.gradient[1, 1]), float(state.gradient[0, 0])
+        moved = shown(state, [round(SIDE * side) for side in sides])
+        told = grid | {"stretch": sides[1], "stretch_across": sides[0]}
+        true = fit_kernel(rest, measure_normals(moved, pixel=PIXEL_UM).histogram, **told)
+        for corner in (0, SIDE - PART):
+            one = rest[corner : corner + PART, corner : corner + PART]
+            rows, columns = (
+                slice(round(corner * side), round((corner + PART) * side)) for side in sides
+            )
+            other = moved[rows, columns]
+            target = measure_normals(other, pixel=PIXEL_UM)
+            about = {"target_samples": target.effective_samples}
+            fit = fit_kernel(
+                one, target.histogram, target_blocks=blocks_of(one, other, sides), **told, **about
+            )
+            error = np.abs([fit.alpha - true.alpha, fit.sigma_um - true.sigma_um])
+            held.append(error <= [fit.alpha_stderr, fit.sigma_stderr_um])
+            held_95.append(error <= [fit.alpha_95, fit.sigma_95_um])
+            if corner == 0:
+                alone = fit_kernel(one, target.histogram, **told, **about)
+                narrower.append(fit.alpha_stderr / alone.alpha_stderr)
     within, within_95 = np.mean(held, axis=0), np.mean(held_95, axis=0)
     chance, chance_95 = 2.0 * np.sqrt(0.68 * 0.32 / 24), 2.0 * np.sqrt(0.95 * 0.05 / 24)
     assert (within >= 0.60 - chance).all(), within

@@ -5,13 +5,14 @@ import multiprocessing
 import os
 
 import pytest
+from fixtures import small_demo
 
+from capture.session import Session
 from model import store
 from skinrig import demo
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
-from skinrig.simulating import dome
 from skinrig.simulating.orders import SimulationError
 from skinrig.viewer.faces import build_scene
 
@@ -98,12 +99,11 @@ def test_parallel_rig_threads_sleep_unless_user_sets_policy(monkeypatch):
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, without_benchmarks):
-    monkeypatch.setattr("skinrig.demo_rigs.DOME_WIDTH_PX", 200)
     # fewer lights and cameras than the demo's own: how accurate a dome is, other tests say
-    monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 32)
-    monkeypatch.setitem(dome.VIEW_COUNTS, "small", 4)
+    monkeypatch.setattr(demo, "_run_rig", small_demo.run_small_rig)
     out = tmp_path / "demo"
-    document = run_demo(out, ["flash", "dome"], console=Console(True), width_px=200)
+    document = run_demo(out, ["flash", "dome"], console=Console(True), width_px=200, jobs=2)
+    assert len(Session.open(out / "session-dome-III").rig.views) == 4
     report = (out / "report.html").read_text(encoding="utf-8")
     assert "Traceback" not in report
     errors = {(subject, name): error for subject, name, error, *_ in document["errors"]}

@@ -108,6 +108,7 @@ def compare_integrators(
     reference_subpixels: int = 6,
     rounds: int = 2,
     sampler: str = "stratified",
+    texels: int = 512,
 ) -> dict[Method, RenderTiming]:
     """Render one view of the dome by several methods, one light at a time.
 
@@ -125,6 +126,8 @@ def compare_integrators(
         Number of repetitions; the fastest counts.
     sampler
         Mitsuba's; "stratified" is its least noisy one here, "independent" its default.
+    texels
+        Texels along each side of the face's maps.
 
     Returns
     -------
@@ -133,7 +136,7 @@ def compare_integrators(
         are not timed; tracing our camera rays is.
     """
     rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
-    view, face = rig.views[0], plain_face()
+    view, face = rig.views[0], plain_face(size=texels)
     chosen = [int(k) for k in np.linspace(0, len(rig.lights) - 1, lights).round()]
     fine_scene = PlainScene(rig, face, subpixels=reference_subpixels)
     reference = np.stack([_per_steradian(fine_scene, k) for k in chosen])
@@ -194,7 +197,12 @@ OLAT_ROUNDING: Final = 2e-4
 
 
 def measure_agreement_with_path(
-    *, width_px: int = 48, runs: int = 25, samples: int = 4096, subpixels: int = 64
+    *,
+    width_px: int = 48,
+    runs: int = 25,
+    samples: int = 4096,
+    subpixels: int = 64,
+    texels: int = 512,
 ) -> float:
     """Return the fraction of pixels where `olat` is within 3 standard errors of Mitsuba's `path`.
 
@@ -209,9 +217,11 @@ def measure_agreement_with_path(
         of each.
     subpixels
         Rays of `olat` along each side of a pixel.
+    texels
+        Texels along each side of the face's maps.
     """
     rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
-    scene, light = DirectScene(rig, make_subject("III", size=512)), rig.lights[45]
+    scene, light = DirectScene(rig, make_subject("III", size=texels)), rig.lights[45]
     place = np.array(light.position_mm)
     mi = load_mitsuba(choose_variant("rgb"))
     described = load_description(

@@ -20,7 +20,7 @@ from rigsim.needs.probe import (
     predict_light,
 )
 from rigsim.needs.tissue import TISSUE_RULES
-from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
+from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, PHOTONS_PER_ANGLE, ProbeScene
 from rigsim.subject.person_skin import SITE_NAMES
 from rigsim.world.suction import HeadState
 from skinrig.arrays import Float32Array, Float64Array
@@ -47,6 +47,7 @@ PROBE_SITE = "cheek"
 PRESET_NAMES = ("I", "II", "III", "IV", "V", "VI")
 N_PEOPLE = 20
 N_TOY_PEOPLE = 1
+TOY_PHOTONS = 20_000
 
 
 def measure_omissions(stage: BenchmarkStage) -> None:
@@ -136,7 +137,7 @@ def compare_probe(*, toy: bool = False) -> Iterator[EffectComparison]:
     images, seconds = [], []
 
     def profiled(tissue: HomogeneousTissue) -> tuple[ProbeScene, Any]:
-        made = ProbeScene(rig, tissue)
+        made = ProbeScene(rig, tissue, photons=TOY_PHOTONS if toy else PHOTONS_PER_ANGLE)
         return made, made.profile(head)
 
     for tissue in (colored, gray):

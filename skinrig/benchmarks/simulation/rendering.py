@@ -29,6 +29,8 @@ from skinrig.benchmarks.resampling import bootstrap_interval, bootstrap_tiled_rm
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 
+TEXELS, TOY_TEXELS = 512, 128
+"""Texels along each side of a face's maps."""
 NO_MEMORY_REASON = "the methods run in turn in one process, which keeps all their scenes"
 
 
@@ -42,6 +44,7 @@ def measure_dome(stage: BenchmarkStage) -> None:
     width, lights = (64, 2) if stage.toy else (1300, 4)
     efforts = (1, 2) if stage.toy else (1, 3, 2)
     fine = 4 if stage.toy else 6
+    texels = TOY_TEXELS if stage.toy else TEXELS
     found: dict[dome_scenes.Method, dome_scenes.RenderTiming] = {}
     for subpixels in efforts:
         found = dome_scenes.compare_integrators(
@@ -49,7 +52,8 @@ def measure_dome(stage: BenchmarkStage) -> None:
             lights=1 if subpixels != efforts[-1] else lights,
             subpixels=subpixels,
             reference_subpixels=fine,
-            rounds=2 if subpixels == efforts[-1] else 1,
+            rounds=2 if subpixels == efforts[-1] and not stage.toy else 1,
+            texels=texels,
         )
         for name, way in found.items():
             timing = Timing.single(way.seconds, no_memory_reason=NO_MEMORY_REASON)
@@ -60,7 +64,8 @@ def measure_dome(stage: BenchmarkStage) -> None:
     stage.limits["over_path"] = found["path"].cost_over(ours)
     stage.limits["over_direct"] = found["direct"].cost_over(ours)
     effort = {"runs": 4, "samples": 64, "subpixels": 8} if stage.toy else {}
-    stage.limits["agreement"] = 100.0 * dome_scenes.measure_agreement_with_path(**effort)
+    agreement = dome_scenes.measure_agreement_with_path(texels=texels, **effort)
+    stage.limits["agreement"] = 100.0 * agreement
     finest = stage.find_point(way="olat", rays=max(efforts) ** 2)
     stage.reference_error = finest.error * max(efforts) / fine
     stage.description_values["rays"] = fine**2
@@ -78,7 +83,7 @@ def _method_error(method: dome_scenes.RenderTiming) -> ErrorEstimate:
 def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
     """Return our error with 4 rays per pixel on a face of a preset's melanin, one light, %."""
     rig = point_light_rig(load_rig("dome").resized(width).subset(views=["C02"]))
-    face = dome_scenes.plain_face(preset, size=128 if width < 128 else 512)
+    face = dome_scenes.plain_face(preset, size=TOY_TEXELS if width < 128 else TEXELS)
     light = len(rig.lights) // 2
     found, true = (
         dome_scenes.PlainScene(rig, face, subpixels=n).radiance("C02", [light])[0]
@@ -127,7 +132,7 @@ def measure_flash(stage: BenchmarkStage) -> None:
             memory=None,
         )
     _add_face_curves(stage)
-    over_fast, difference = _olat_over_fast(64 if stage.toy else 384)
+    over_fast, difference = _olat_over_fast(stage)
     stage.limits = {"difference": difference}
     if not stage.toy:
         final = flash_scenes.compare_polarizer_models(
@@ -143,7 +148,8 @@ def _add_face_curves(stage: BenchmarkStage) -> None:
     The reference is `olat` with more rays, so that errors of the fast way include its shadows,
     which have the resolution of the face's texture.
     """
-    rig, face = load_rig("flash").resized(64 if stage.toy else 256), make_subject("III")
+    rig = load_rig("flash").resized(64 if stage.toy else 256)
+    face = make_subject("III", size=TOY_TEXELS if stage.toy else TEXELS)
     kept = []  # scenes of a way share the light on the surface, as long as one lives
 
     def render(way: Renderer, subpixels: int) -> tuple[float, dict[str, Float32Array]]:
@@ -168,15 +174,16 @@ def _add_face_curves(stage: BenchmarkStage) -> None:
             stage.add(knobs, timing, _larger_error(runs[0][1], truth))
 
 
-def _olat_over_fast(width_px: int) -> tuple[float, float]:
+def _olat_over_fast(stage: BenchmarkStage) -> tuple[float, float]:
     """Compare both renderers of the flash rig: processor time, and relative difference of means."""
-    rig, face = load_rig("flash").resized(width_px), make_subject("III")
+    rig = load_rig("flash").resized(64 if stage.toy else 384)
+    face = make_subject("III", size=TOY_TEXELS if stage.toy else TEXELS)
     scalar = choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"})
     ways = {"olat": choose_variant("rgb"), "fast": scalar}
     spent: dict[str, list[float]] = {way: [] for way in ways}
     mean: dict[str, float] = {}
     scenes = []  # those of a way share the light on the surface, as long as one lives
-    for _ in range(6):  # the first compiles
+    for _ in range(2 if stage.toy else 6):  # the first compiles
         for way, choice in ways.items():
             scene = FlashScene(rig, face, effects=DIRECT_LIGHT, choice=choice)
             scenes.append(scene)

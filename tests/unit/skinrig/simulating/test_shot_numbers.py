@@ -3,6 +3,7 @@
 import itertools
 from collections import Counter
 from contextlib import nullcontext
+from functools import cache
 
 import numpy as np
 import pytest
@@ -54,13 +55,28 @@ def read_files(folder):
     }
 
 
+@pytest.fixture(scope="module")
+def whole_files(tmp_path_factory):
+    """Files of an uninterrupted session by rig; each is simulated once."""
+
+    @cache
+    def simulate(rig):
+        folder = tmp_path_factory.mktemp(rig) / "whole"
+        simulate_session(rig, folder, **ASKED[rig])
+        return read_files(folder)
+
+    return simulate
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "count"), [("flash", 2), ("dome", 3), ("dome", 8), ("probe", 3), ("gradient", 20)]
 )
-def test_resumed_session_has_bytes_of_uninterrupted_session(tmp_path, monkeypatch, rig, count):
+def test_resumed_session_has_bytes_of_uninterrupted_session(
+    tmp_path, monkeypatch, whole_files, rig, count
+):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1795000000")
-    simulate_session(rig, tmp_path / "whole", **ASKED[rig])
+    whole = whole_files(rig)
     exposed: Counter[tuple[str, int]] = Counter()
     expose = World.expose
 
@@ -79,7 +95,7 @@ def test_resumed_session_has_bytes_of_uninterrupted_session(tmp_path, monkeypatc
             left = {path.name for path in (tmp_path / ".parts.exposures").glob("*.npy")}
             assert len(left) <= len(session.pending_frames())
             assert len(session.frames()) >= count
-    whole, parts = read_files(tmp_path / "whole"), read_files(tmp_path / "parts")
+    parts = read_files(tmp_path / "parts")
     assert whole.keys() == parts.keys()
     assert [key for key in whole if whole[key] != parts[key]] == []
     # every image was stored before its frame was refused: none is computed again
