@@ -101,13 +101,13 @@ def open_worker_pool(workers: int = MAX_WORKERS) -> Iterator[tuple[Executor | No
     """Open threads for independent tiles that each use all of NumPy and Numba.
 
     Numba's threads are divided among the workers, and BLAS has one, so that a tile's bytes do not
-    depend on the number of workers. Where parallel kernels must not be called from several threads
-    (Numba's own thread pool), or have not been called yet, there is one worker.
+    depend on their number. Numba's own thread pool must not be called from several threads: with it
+    there is one worker.
 
     Parameters
     ----------
     workers
-        Most threads; at most Numba's number of threads is used.
+        Most threads; at most Numba's number of threads is used. With 1, nothing is changed.
 
     Yields
     ------
@@ -122,20 +122,15 @@ def open_worker_pool(workers: int = MAX_WORKERS) -> Iterator[tuple[Executor | No
     ...     list(map_tiles(abs, [-1, 2, -3], executor=executor, window=workers))
     [1, 2, 3]
     """
-    threads = get_num_threads()
-    count = min(workers, threads) if _has_safe_threads() else 1
+    if workers < 2:
+        yield None, 1
+        return
+    threads = get_num_threads()  # starts them, which chooses their layer
+    count = min(workers, threads) if threading_layer() in ("omp", "tbb") else 1
     with threadpool_limits(1, user_api="blas"):
         if count < 2:
             yield None, 1
             return
-        own = (threads // count,)
-        with ThreadPoolExecutor(count, initializer=set_num_threads, initargs=own) as pool:
+        left = iter([threads // count + (number < threads % count) for number in range(count)])
+        with ThreadPoolExecutor(count, initializer=lambda: set_num_threads(next(left))) as pool:
             yield pool, count
-
-
-def _has_safe_threads() -> bool:
-    """Return whether several threads may call parallel kernels at once."""
-    try:
-        return threading_layer() in ("omp", "tbb")
-    except ValueError:  # not chosen before the first parallel kernel
-        return False

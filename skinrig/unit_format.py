@@ -2,9 +2,11 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterable
 from typing import Final
 
+_INNER_FORMULA: Final = re.compile(r"([;\t\n]\s*)([=+\-@])")
 DEGREE_SIGN: Final = "°"
 _SIGN_BY_UNIT: Final = {"deg": DEGREE_SIGN, "1": ""}
 
@@ -52,9 +54,9 @@ def format_quantity(number: str, unit: str) -> str:
 def format_csv(rows: Iterable[Iterable[object]]) -> str:
     r"""Return rows as CSV in which no text is a formula.
 
-    Spreadsheets run a cell that begins with one of ``= + - @``, also after blanks. Names in other
-    people's sessions may be such; an apostrophe before them makes them text. Numbers given as text
-    stay; carriage returns become blanks.
+    Spreadsheets run a cell that begins with one of ``= + - @``, also after blanks; some begin a
+    cell after a semicolon or a tab. Names in other people's sessions may be such; an apostrophe
+    makes them text. Numbers given as text stay; carriage returns become blanks.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def format_csv(rows: Iterable[Iterable[object]]) -> str:
 
 
 def _disarm(cell: str) -> str:
-    cell = cell.replace("\r", " ")  # would end a row
+    cell = _INNER_FORMULA.sub(r"\1'\2", cell.replace("\r", " "))  # \r would end a row
     if not cell.lstrip().startswith(("=", "+", "-", "@")):
         return cell
     try:

@@ -6,6 +6,7 @@ row and one chunk, however many points there are. Without a folder the tables ar
 the chunks of a small surface, which every estimate reads.
 """
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -105,6 +106,7 @@ class LumitexelStore:
         self._on_disk = folder is not None
         self._kept_bytes = 0 if self._on_disk else MAX_CACHED_BYTES
         self._kept: dict[tuple[int, int], Lumitexels] = {}
+        self._lock = threading.Lock()
         self._tables = [
             _table(folder, view, (self.light_count, 2, len(rows), 3), np.dtype(dtype))
             for view, rows in enumerate(self._rows)
@@ -193,10 +195,10 @@ class LumitexelStore:
         if part in self._kept:
             return self._kept[part]
         found = self._chunk(start, stop)
-        # several threads read chunks at once: the list is made in one step
-        samples = sum(kept.valid.size for kept in [found, *list(self._kept.values())])
-        if BYTES_PER_SAMPLE * samples <= self._kept_bytes:
-            self._kept[part] = found
+        with self._lock:  # several threads read chunks at once
+            samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
+            if BYTES_PER_SAMPLE * samples <= self._kept_bytes:
+                self._kept[part] = found
         return found
 
     def _chunk(self, start: int, stop: int) -> Lumitexels:

@@ -36,6 +36,7 @@ from rigsim.skin_patch.stretch_kernels import (
     add_bending_forces,
     add_membrane_forces,
     add_tissue_forces,
+    find_least_area,
     gather_coefficient_forces,
     rotate_coefficients,
 )
@@ -309,7 +310,7 @@ def find_equilibrium(
     Raises
     ------
     EquilibriumError
-        When `steps` are not enough.
+        When `steps` are not enough, or elements of the result are inverted.
 
     References
     ----------
@@ -360,9 +361,14 @@ def find_equilibrium(
         raise EquilibriumError(
             f"residual: got {residuals[-1]:.2g} after {steps} steps, expected <= {tolerance}"
         )
-    return problem.state(q), Convergence(
-        evaluations, residuals[-1], tuple(energies), tuple(residuals)
-    )
+    state = problem.state(q)
+    least = float(find_least_area(state, problem.gradient, problem.texel_um))
+    if least <= 0.0:
+        raise EquilibriumError(
+            f"state: got an element of {least:.2g} times its affine area, expected > 0; the "
+            "surface folds over; give a stretch nearer to 1"
+        )
+    return state, Convergence(evaluations, residuals[-1], tuple(energies), tuple(residuals))
 
 
 def _direction(slope: ComplexArray, pairs: Pairs) -> ComplexArray:

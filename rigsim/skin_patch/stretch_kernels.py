@@ -157,6 +157,40 @@ def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: 
     return part.sum()
 
 
+@njit(cache=True)
+def find_least_area(v, f, texel):  # type: ignore[no-untyped-def]
+    """Return the least projected area of an element over that of the affine state; <= 0: inverted.
+
+    Parameters are those of `add_membrane_forces`.
+    """
+    rows, columns = v.shape[1:]
+    h = 1.0 / texel
+    least = np.inf
+    for i in range(rows):
+        k = (i + 1) % rows
+        for j in range(columns):
+            m = (j + 1) % columns
+            b1, b2 = (
+                f[0, 0] + h * (v[0, i, m] - v[0, i, j]),
+                f[1, 0] + h * (v[1, i, m] - v[1, i, j]),
+            )
+            t1, t2 = (
+                f[0, 0] + h * (v[0, k, m] - v[0, k, j]),
+                f[1, 0] + h * (v[1, k, m] - v[1, k, j]),
+            )
+            l1, l2 = (
+                f[0, 1] + h * (v[0, k, j] - v[0, i, j]),
+                f[1, 1] + h * (v[1, k, j] - v[1, i, j]),
+            )
+            r1, r2 = (
+                f[0, 1] + h * (v[0, k, m] - v[0, i, m]),
+                f[1, 1] + h * (v[1, k, m] - v[1, i, m]),
+            )
+            below = min(b1 * l2 - b2 * l1, b1 * r2 - b2 * r1)
+            least = min(least, min(below, min(t1 * l2 - t2 * l1, t1 * r2 - t2 * r1)))
+    return least / (f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0])
+
+
 @njit(parallel=True, cache=True, fastmath=True)
 def add_bending_forces(height, neutral, stiffness, texel, moment, force):  # type: ignore[no-untyped-def]
     """Add the forces against a change of curvature to ``force``; return the energy's sum.

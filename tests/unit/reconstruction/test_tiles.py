@@ -67,13 +67,18 @@ def test_workers_divide_threads_and_run_parallel_kernels_together():
     assert numba.get_num_threads() == most
 
 
-@pytest.mark.parametrize("layer", ["workqueue", ValueError("not chosen yet")])
-def test_kernels_of_unsafe_threads_get_one_worker(monkeypatch, layer):
-    def chosen():
-        if isinstance(layer, ValueError):
-            raise layer
-        return layer
-
-    monkeypatch.setattr(module, "threading_layer", chosen)
+def test_threads_of_numbas_own_pool_get_one_worker(monkeypatch):
+    monkeypatch.setattr(module, "threading_layer", lambda: "workqueue")
     with open_worker_pool() as (executor, workers):
         assert (executor, workers) == (None, 1)
+
+
+def test_all_threads_are_given_to_workers(monkeypatch):
+    given = []
+    monkeypatch.setattr(module, "threading_layer", lambda: "omp")
+    monkeypatch.setattr(module, "get_num_threads", lambda: 7)
+    monkeypatch.setattr(module, "set_num_threads", given.append)
+    met = threading.Barrier(4, timeout=20)  # all four threads are started
+    with open_worker_pool(4) as (executor, workers):
+        assert list(map_tiles(lambda _: met.wait() >= 0, range(4), executor=executor)) == [True] * 4
+    assert (workers, sorted(given)) == (4, [1, 2, 2, 2])

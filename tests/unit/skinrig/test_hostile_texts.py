@@ -84,10 +84,14 @@ def test_console_escapes_what_commands_a_terminal(as_json, capsys):
     assert not {"\x1b", "\r"} & set(text)
 
 
-@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1"])
-def test_text_in_csv_is_no_formula(text):
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\r=1"])
+def test_text_in_csv_is_not_a_formula(text):
     (cells,) = csv.reader(io.StringIO(format_csv([(text, -1.5, "-1.5", "a=b")]), newline=""))
     assert cells == ["'" + text.replace("\r", " "), "-1.5", "-1.5", "a=b"]
+
+
+def test_text_in_csv_is_not_a_formula_after_other_separators():
+    assert format_csv([("a;=1", "b; @x", "c-d")]) == "a;'=1,b; '@x,c-d\n"
 
 
 def test_every_written_csv_passes_the_guard():

@@ -102,7 +102,7 @@ def test_run_interrupted_anywhere_resumes_to_same_result(tmp_path, at):
 
 @pytest.mark.parametrize("at", EVERYTHING)
 def test_interrupted_threads_repeat_at_most_one_tile_each(tmp_path, at, monkeypatch):
-    monkeypatch.setattr(tiles, "_has_safe_threads", lambda: True)
+    monkeypatch.setattr(tiles, "threading_layer", lambda: "omp")
     monkeypatch.setattr(tiles, "get_num_threads", lambda: 2)
     monkeypatch.setattr(tiles, "set_num_threads", lambda _: None)
     expected = Run(tmp_path / "whole").run()

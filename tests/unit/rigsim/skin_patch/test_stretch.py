@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rigsim.skin_patch import equilibrium
 from rigsim.skin_patch.equilibrium import (
     EquilibriumError,
     LayerProblem,
@@ -25,6 +26,7 @@ from rigsim.skin_patch.stretch_kernels import (
     LEAST_LOG_AREA,
     add_bending_forces,
     add_membrane_forces,
+    find_least_area,
 )
 from rigsim.subject.person_skin import SiteSkin
 from rigsim.tissue.skin_layers import TYPICAL_SKIN
@@ -117,6 +119,7 @@ def test_the_membranes_energy_is_that_of_its_metric(
             expected += 0.25 * float(np.sum(square * w + bulk * (j - 1.0 + minus_log)))
             least = min(least, float(j.min()))
     assert (least < -0.1) == inverted
+    assert find_least_area(v, p.gradient, p.texel_um) == pytest.approx(least, rel=1e-10)
     assert got == pytest.approx(expected, rel=1e-10)
 
 
@@ -136,6 +139,14 @@ def test_inverted_elements_are_pushed_back_smoothly(rng: np.random.Generator) ->
     energies = [energy(push_um)[0] for push_um in (0.0, 8.0, 16.0, 30.0)]
     assert np.isfinite(energies).all()
     assert (np.diff(energies) > 0).all()
+
+
+def test_inverted_result_is_refused(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(equilibrium, "find_least_area", lambda *_: -0.1)
+    with pytest.raises(EquilibriumError, match="folds over"):
+        find_equilibrium(problem_of(rng), tolerance=5e-3)
 
 
 def test_bending_costs_nothing_at_the_neutral_curvature(rng: np.random.Generator) -> None:
