@@ -1,6 +1,6 @@
 """The dome from targets to maps of a face: captured by its drivers, calibrated, reconstructed.
 
-The dome is small, 4 cameras 200 pixels across and 32 lights, so that a pixel of its images (2 x 2
+The dome is small, 5 cameras 200 pixels across and 40 lights, so that a pixel of its images (2 x 2
 cells of the sensor) is 3.3 mm on the face. Limits say what follows from that; how accurate a full
 dome is, the benchmarks say. Light that spreads sideways in skin blurs less than such a pixel and is
 left out, as in the demo: `test_held_out_photographs.py` has it in its faces.
@@ -26,7 +26,7 @@ from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
-SMALL = {"seed": 0, "width_px": 200, "views": 4, "lights": 32}
+SMALL = {"seed": 0, "width_px": 200, "views": 5, "lights": 40}
 FACE = SMALL | {"leave_out": ("subsurface",)}
 WANT = ("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples")
 PIXEL_MM = 3.3
