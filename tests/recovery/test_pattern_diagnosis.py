@@ -71,6 +71,10 @@ def test_series_without_inverse_patterns_is_complete(images, tmp_path, capsys):
     code, found = diagnose(write_gradient_session(tmp_path / "t", turned), capsys)
     assert code == 1
     assert {one["fault"] for one in found["findings"]} == {"exchanged patterns"}
+    for one in found["findings"]:
+        named = [found["names"][number - 1].split() for number in one["images"]]
+        assert len({light for _, light, _ in named}) == 1
+        assert {pattern for _, _, pattern in named} == {"x", "y"}
 
 
 XY_PARALLEL = ("x", "parallel"), ("y", "parallel")
