@@ -3,10 +3,11 @@
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from capture import raw
 from capture.documents import Fault, InputError
@@ -99,6 +100,7 @@ def import_photos(
     subject: SubjectRecord | None = None,
     framing: Framing | None = None,
     assumed: Sequence[str] = (),
+    video: Mapping[str, Any] | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -131,6 +133,8 @@ def import_photos(
         Part and width of the photographs to import; default: all of them.
     assumed : sequence of str
         What the caller assumed; stored before the import's own assumptions.
+    video : mapping, optional
+        Description of the video whose frames these are, for the manifest; see `ImageSource`.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -155,7 +159,8 @@ def import_photos(
             faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
             advice="Leave the rig out, or crop and width.",
         )
-    entries = _inspect(files, framing, turn_raw=rig is None)
+    repair = "Repair these files or move them away" if video is None else "Cut these frames out"
+    entries = _inspect(files, framing, turn_raw=rig is None, repair=repair)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
@@ -167,7 +172,7 @@ def import_photos(
         | ({"face": list(e.face)} if e.face else {})
         for s, e in steps
     ]
-    extra = {"assumed": assumed, "photographs": listed}
+    extra = {"assumed": assumed, "photographs": listed} | ({"video": dict(video)} if video else {})
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
@@ -212,7 +217,9 @@ def _advise(names: Sequence[str]) -> str:
     return next((text for name in names if (text := advise_conversion(name))), "")
 
 
-def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list[_Entry]:
+def _inspect(
+    files: Sequence[Path], framing: Framing, *, turn_raw: bool, repair: str
+) -> list[_Entry]:
     """Decode every file once, so that a bad one is found before anything is written.
 
     Calibrations of a rig apply to the rows of its sensor: its raw files are not turned.
@@ -242,10 +249,7 @@ def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list
             where=str(files[0].parent),
             faults=faults,
             advice=" ".join(
-                [
-                    "Repair these files or move them away; nothing was written.",
-                    _advise([fault.path for fault in faults]),
-                ]
+                [f"{repair}; nothing was written.", _advise([fault.path for fault in faults])]
             ).strip(),
             code="SR-IMP-013",
         )
