@@ -59,7 +59,10 @@ class PhotoImport:
     color_states: tuple[str, ...] = ()
     """Subset of `states` with color photographs; chromophores need color."""
     has_pairs: bool = False
-    """Whether a state has a parallel and a crossed photograph of one size and color."""
+    """Whether a state has a parallel and a crossed photograph of one size and color.
+
+    Both files name their polarizer: one that names none counts as crossed by assumption only.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +183,7 @@ def import_photos(
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
-    pairs = any(len({e.camera[1:3] for e in pair}) == 1 for pair in _group_pairs(steps))
+    pairs = any(_is_polarized_pair(pair) for pair in _group_pairs(steps))
     return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored, pairs)
 
 
@@ -396,6 +399,12 @@ def _group_pairs(steps: Sequence[tuple[Step, _Entry]]) -> list[list[_Entry]]:
     for step, entry in steps:
         states.setdefault(step.index["state"], []).append(entry)
     return [entries for entries in states.values() if len(entries) > 1]
+
+
+def _is_polarized_pair(entries: Sequence[_Entry]) -> bool:
+    """Return whether photographs of one state name both polarizers, in one size and color."""
+    named = {_parse_stem(entry.file.stem)[1] for entry in entries}
+    return named == {"parallel", "crossed"} and len({e.camera[1:3] for e in entries}) == 1
 
 
 def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:

@@ -41,7 +41,7 @@ from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.pipeline.skin_tone import maps as tone
 from reconstruction.pipeline.skin_tone.maps import SkinReflectance
 
-STAGE_REVISION = 12
+STAGE_REVISION = 13
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = (
@@ -57,11 +57,15 @@ MAP_NAMES = (
 
 @dataclass(frozen=True, slots=True)
 class FlashImage:
-    """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
+    """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W).
+
+    `neutral` is the first frame's camera RGB of white; None: not recorded.
+    """
 
     rgb: Float32Array
     variance: Float32Array
     valid: BoolArray
+    neutral: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,9 +229,8 @@ def _diagnose(rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage) -
     groups = []
     if parallel is not None and parallel.rgb.shape == crossed.rgb.shape:
         usable = parallel.valid & crossed.valid
-        neutral = rig.session.read(rig.session.frames("subject", state=rig.inputs.state)[0]).neutral
         names = [f"{rig.inputs.state} {polarizer}" for polarizer in ("parallel", "crossed")]
-        groups.append(diagnose_pair(parallel.rgb, crossed.rgb, usable, neutral, names))
+        groups.append(diagnose_pair(parallel.rgb, crossed.rgb, usable, parallel.neutral, names))
     collect_images(groups).record_in(rig.inputs)
 
 
@@ -237,21 +240,29 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
     demosaic: raw.Demosaic = "superpixel" if session.manifest.has_developed_images else "centered"
     gain, read_noise = _noise(rig.sensor)
 
-    def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
-        known: dict[str, Any] = {"demosaic": demosaic, "gain": gain, "read_noise": read_noise}
-        return [raw.linear_rgb(session.read(record), **known) for record in records]
+    known: dict[str, Any] = {"demosaic": demosaic, "gain": gain, "read_noise": read_noise}
+
+    def linear_light(
+        records: Sequence[FrameRecord],
+    ) -> tuple[list[raw.LinearImage], tuple[float, ...] | None]:
+        images, neutrals = [], []
+        for record in records:
+            frame = session.read(record)
+            images.append(raw.linear_rgb(frame, **known))
+            neutrals.append(frame.neutral)
+        return images, next(iter(neutrals), None)
 
     def total(images: list[raw.LinearImage], name: str) -> NDArray[Any]:
         parts = [getattr(image, name) for image in images]
         return np.asarray(np.sum(parts, axis=0, dtype=np.float64))
 
-    darks = linear_light(session.frames("dark"))
+    darks, _ = linear_light(session.frames("dark"))
     count = max(len(darks), 1)
     dark = total(darks, "rgb") / count
     dark_variance = total(darks, "variance") / count / count
 
     def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
-        linear = linear_light(records)
+        linear, neutral = linear_light(records)
         sizes = {image.rgb.shape for image in linear}
         name = records[0].index.get("polarizer") or records[0].index["light"]
         expected = "one camera setting; choose frames of one"
@@ -263,6 +274,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
             (rgb / power).astype(np.float32),
             (variance / power**2).astype(np.float32),
             np.logical_and.reduce([image.valid for image in linear]),
+            neutral,
         )
 
     return mean_image
