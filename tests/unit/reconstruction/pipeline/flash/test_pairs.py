@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture import raw
-from reconstruction.pipeline.flash import stages
+from reconstruction.pipeline.flash.mean_frames import make_image_reader
 from reconstruction.pipeline.flash.pair_diagnosis import list_pairs
 
 SIDE = 16
@@ -59,6 +59,6 @@ def test_white_is_that_of_the_frames_read():
 
     session = make_session(records)
     session.read = read_frame
-    found = stages._image_reader(SimpleNamespace(session=session, sensor=None))(records)
+    found = make_image_reader(session, None)(records)
     assert found.neutral == (0.5, 1.0, 0.25)
     assert read == records
