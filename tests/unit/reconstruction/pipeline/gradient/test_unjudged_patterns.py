@@ -1,5 +1,7 @@
 """Findings about patterns name only images that exist, and a bad state stops no other one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,9 @@ def test_unjudged_state_is_noted_and_skipped(monkeypatch):
     found = pattern_diagnosis.diagnose_states(States(), PlannedSession())
     assert {name.split()[0] for name in found.names} == {"a", "c"}
     assert found.assumed == ("the patterns of b were not compared: state b: got no lit image",)
+    inputs = SimpleNamespace(noted={}, assumed=["before"])
+    found.record_in(inputs)
+    assert inputs.assumed == ["before", *found.assumed]
 
 
 def test_session_without_judged_state_is_refused(monkeypatch):
