@@ -1,10 +1,10 @@
 """Import images of one object under many lights into a closed SESSION/."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,7 @@ def import_light_list(
     mm_per_px: float | None = None,
     subject: SubjectRecord | None = None,
     assumed: Sequence[str] = (),
+    video: Mapping[str, Any] | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> ImageStackImport:
     """Import images of one object under many lights into a closed session; all, or none.
@@ -92,6 +93,8 @@ def import_light_list(
         Subject of the images; default an unnamed one.
     assumed : sequence of str
         What the caller assumed about images and lights; stored with the import's own assumptions.
+    video : mapping, optional
+        Description of the video whose frames these are, for the manifest; see `ImageSource`.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -154,7 +157,7 @@ def import_light_list(
             {"step": step.id, "sha256": hash_file(file), "encoding": shown}
             for step, file in zip(steps, found.images, strict=True)
         ],
-    }
+    } | ({"video": dict(video)} if video else {})
     target = Path(out)
     with create_imported_session(
         target, Plan(rig.name, steps), rig, subject, extra, clock

@@ -70,7 +70,8 @@ def make_placeholder_rig(name: str, lights: Sequence[Light], *views: View) -> Ri
 
 def hash_file(file: Path) -> str:
     """Return the digest of a file's bytes, prefixed with its algorithm's name."""
-    return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
+    with file.open("rb") as stream:
+        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
 
 
 @contextmanager

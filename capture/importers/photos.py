@@ -3,10 +3,11 @@
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from capture import raw
 from capture.documents import Fault, InputError
@@ -58,7 +59,10 @@ class PhotoImport:
     color_states: tuple[str, ...] = ()
     """Subset of `states` with color photographs; chromophores need color."""
     has_pairs: bool = False
-    """Whether a state has a parallel and a crossed photograph of one size and color."""
+    """Whether a state has a parallel and a crossed photograph of one size and color.
+
+    Both files name their polarizer: one that names none counts as crossed by assumption only.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,7 @@ def import_photos(
     subject: SubjectRecord | None = None,
     framing: Framing | None = None,
     assumed: Sequence[str] = (),
+    video: Mapping[str, Any] | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -131,6 +136,8 @@ def import_photos(
         Part and width of the photographs to import; default: all of them.
     assumed : sequence of str
         What the caller assumed; stored before the import's own assumptions.
+    video : mapping, optional
+        Description of the video whose frames these are, for the manifest; see `ImageSource`.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -155,7 +162,8 @@ def import_photos(
             faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
             advice="Leave the rig out, or crop and width.",
         )
-    entries = _inspect(files, framing, turn_raw=rig is None)
+    repair = "Repair these files or move them away" if video is None else "Cut these frames out"
+    entries = _inspect(files, framing, turn_raw=rig is None, repair=repair)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
@@ -167,7 +175,7 @@ def import_photos(
         | ({"face": list(e.face)} if e.face else {})
         for s, e in steps
     ]
-    extra = {"assumed": assumed, "photographs": listed}
+    extra = {"assumed": assumed, "photographs": listed} | ({"video": dict(video)} if video else {})
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
@@ -175,7 +183,7 @@ def import_photos(
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
-    pairs = any(len({e.camera[1:3] for e in pair}) == 1 for pair in _group_pairs(steps))
+    pairs = any(_is_polarized_pair(pair) for pair in _group_pairs(steps))
     return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored, pairs)
 
 
@@ -212,7 +220,9 @@ def _advise(names: Sequence[str]) -> str:
     return next((text for name in names if (text := advise_conversion(name))), "")
 
 
-def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list[_Entry]:
+def _inspect(
+    files: Sequence[Path], framing: Framing, *, turn_raw: bool, repair: str
+) -> list[_Entry]:
     """Decode every file once, so that a bad one is found before anything is written.
 
     Calibrations of a rig apply to the rows of its sensor: its raw files are not turned.
@@ -242,10 +252,7 @@ def _inspect(files: Sequence[Path], framing: Framing, *, turn_raw: bool) -> list
             where=str(files[0].parent),
             faults=faults,
             advice=" ".join(
-                [
-                    "Repair these files or move them away; nothing was written.",
-                    _advise([fault.path for fault in faults]),
-                ]
+                [f"{repair}; nothing was written.", _advise([fault.path for fault in faults])]
             ).strip(),
             code="SR-IMP-013",
         )
@@ -392,6 +399,12 @@ def _group_pairs(steps: Sequence[tuple[Step, _Entry]]) -> list[list[_Entry]]:
     for step, entry in steps:
         states.setdefault(step.index["state"], []).append(entry)
     return [entries for entries in states.values() if len(entries) > 1]
+
+
+def _is_polarized_pair(entries: Sequence[_Entry]) -> bool:
+    """Return whether photographs of one state name both polarizers, in one size and color."""
+    named = {_parse_stem(entry.file.stem)[1] for entry in entries}
+    return named == {"parallel", "crossed"} and len({e.camera[1:3] for e in entries}) == 1
 
 
 def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:

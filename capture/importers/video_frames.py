@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from capture.documents import Fault
+from capture.documents import Fault, InputError
 from capture.importers.image_checks import (
     FRAMES_ADVICE,
     VIDEO_SUFFIXES,
@@ -18,6 +20,7 @@ from capture.importers.image_checks import (
     check_size,
     read_head,
 )
+from capture.importers.imported_session import hash_file
 
 MAX_FRAMES = 1000
 """Frames of a video that are imported; longer ones are refused."""
@@ -25,6 +28,9 @@ MIN_DECODED_FRACTION = 0.98
 """Of the frames that the file states; fewer count as lost, as these counts are estimates."""
 LOSSLESS_CODECS = frozenset(("FFV1", "HFYU", "FFVH", "PNG ", "MPNG"))
 PNG_COMPRESSION = 1
+SPACE_ADVICE = (
+    "Free space there, name another folder for temporary files by TMPDIR, or cut the video."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +43,14 @@ class ImageSource:
         Folder or file that an import reads.
     assumed
         Assumptions and losses, one sentence each; empty unless it was a video.
+    video
+        For a session's manifest: name, SHA-256, codec, and stated and decoded number of frames of
+        the video; None unless it was one.
     """
 
     path: Path
     assumed: tuple[str, ...] = ()
+    video: Mapping[str, Any] | None = None
 
 
 def is_video(path: Path) -> bool:
@@ -52,7 +62,8 @@ def is_video(path: Path) -> bool:
 def open_source(path: Path) -> Iterator[ImageSource]:
     """Yield a folder of images, or that of a video's frames, which is removed afterwards.
 
-    The frames are 8-bit PNG files named 00001.png and so on.
+    The frames are 8-bit PNG files named 00001.png and so on. An error about one of them names the
+    video and the number of the frame instead.
 
     Parameters
     ----------
@@ -62,7 +73,8 @@ def open_source(path: Path) -> Iterator[ImageSource]:
     Raises
     ------
     PhotoError
-        For a video that cannot be decoded, or is too long.
+        For a video that cannot be decoded, is too long, or whose frames need more space than is
+        free.
     """
     if not is_video(path):
         yield ImageSource(path)
@@ -70,11 +82,47 @@ def open_source(path: Path) -> Iterator[ImageSource]:
     with tempfile.TemporaryDirectory(prefix="skinrig-") as scratch:
         folder = Path(scratch) / path.stem
         folder.mkdir()
-        yield ImageSource(folder, tuple(_write_frames(path, folder)))
+        source = _write_frames(path, folder)
+        try:
+            yield source
+        except Exception as error:  # of any package: their messages name the removed folder
+            _name_video(error, path, folder)
+            raise
 
 
-def _write_frames(video: Path, folder: Path) -> list[str]:
-    """Write the frames of a video, and return the assumptions that they rest on."""
+def _name_video(error: Exception, video: Path, folder: Path) -> None:
+    """Replace the paths of frames in an error by the video and the number of the frame."""
+    frame = re.compile(re.escape(str(folder)) + r"[\\/](\d{5})\.png")
+
+    def rename(text: str) -> str:
+        text = frame.sub(lambda found: f"{video}, frame {int(found[1])}", text)
+        return text.replace(str(folder), str(video))
+
+    if not isinstance(error, InputError):
+        error.args = tuple(rename(one) if isinstance(one, str) else one for one in error.args)
+        return
+    bare = re.compile(r"(\d{5})\.png")
+    faults = [
+        replace(
+            one,
+            path=f"frame {int(found[1])}" if (found := bare.fullmatch(one.path)) else one.path,
+            got=rename(one.got),
+            expected=rename(one.expected),
+        )
+        for one in error.faults
+    ]
+    InputError.__init__(
+        error,
+        error.what,
+        where=rename(error.where),
+        faults=faults,
+        advice=error.advice,
+        code=error.code,
+    )
+
+
+def _write_frames(video: Path, folder: Path) -> ImageSource:
+    """Write the frames of a video, and return their folder with what they rest on."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: errors are ours
     import cv2
 
@@ -100,11 +148,9 @@ def _write_frames(video: Path, folder: Path) -> list[str]:
             _require_short(max(count, stated), where)
             file = folder / f"{count:05d}.png"
             if not cv2.imwrite(str(file), frame, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]):
-                raise PhotoError(
-                    "frames cannot be written",
-                    where=str(folder),
-                    advice="Free space in the folder for temporary files (TMPDIR).",
-                )
+                raise PhotoError("frames cannot be written", where=str(folder), advice=SPACE_ADVICE)
+            if count == 1:
+                _require_space(folder, file.stat().st_size, max(stated, 1))
         if not count:
             raise _not_decodable(where, "no frame that can be decoded")
         codec = _read_codec(stream)
@@ -112,7 +158,32 @@ def _write_frames(video: Path, folder: Path) -> list[str]:
         stream.release()
         cv2.utils.logging.setLogLevel(level)
     bits = 8.0 * video.stat().st_size / (width * height * count)
-    return _list_assumptions(codec, bits, count, stated)
+    about = {
+        "name": video.name,
+        "sha256": hash_file(video),
+        "codec": codec.strip(),
+        "stated_frames": stated,
+        "decoded_frames": count,
+    }
+    return ImageSource(folder, tuple(_list_assumptions(codec, bits, count, stated)), about)
+
+
+def _require_space(folder: Path, first_bytes: int, stated: int) -> None:
+    """Refuse a video whose other frames, each as large as the first one, do not fit."""
+    free, needed = shutil.disk_usage(folder).free, (stated - 1) * first_bytes
+    if needed > free:
+        raise PhotoError(
+            "has too little space for the video's frames",
+            where=str(folder.parent.parent),
+            faults=[
+                Fault(
+                    "free space",
+                    f"{free / 1e6:.0f} MB",
+                    f"{needed / 1e6:.0f} MB for {stated} frames of {first_bytes / 1e6:.2g} MB",
+                )
+            ],
+            advice=SPACE_ADVICE,
+        )
 
 
 def _require_short(count: int, where: str) -> None:

@@ -45,7 +45,8 @@ class DiagnosedImages:
     listed
         (N, 3), unit vectors of the list, in the order of the images; None: of other sessions.
     assumed
-        What the import of the images assumed, such as the loss by compression of a video.
+        What the import of the images assumed, such as the loss by compression of a video, and
+        which images could not be compared.
     """
 
     findings: tuple[Finding, ...]
@@ -64,6 +65,7 @@ class DiagnosedImages:
         inputs.noted["diagnosis"] = [
             one.to_json() | {"names": [self.names[k] for k in one.frames]} for one in self.findings
         ]
+        inputs.assumed += self.assumed
         inputs.assumed += [
             f"{one.fault} ({self.name_images(one)}): {one.evidence}; {one.remedy}"
             for one in self.findings
@@ -105,8 +107,21 @@ def collect_images(groups: Iterable[ImageGroup]) -> DiagnosedImages:
 
 
 def renumber(findings: Iterable[Finding], numbers: Sequence[int]) -> list[Finding]:
-    """Return findings about some of the images with the numbers of all."""
-    return [replace(one, frames=tuple(sorted(numbers[k] for k in one.frames))) for one in findings]
+    """Return findings about some of the images with the numbers of all.
+
+    Raises
+    ------
+    ValueError
+        If a finding's frame or its new number is negative: it would count from the end.
+    """
+    found = []
+    for one in findings:
+        frames = tuple(sorted(numbers[k] for k in one.frames))
+        if min((*one.frames, *frames), default=0) < 0:
+            got = f"{one.fault}: got frames {one.frames} with the numbers {frames}"
+            raise ValueError(f"{got}, expected none below 0; leave out images that are not there")
+        found.append(replace(one, frames=frames))
+    return found
 
 
 def mark_faults(maps: Mapping[str, Any], faults: Sequence[str]) -> dict[str, Any]:

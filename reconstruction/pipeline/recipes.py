@@ -192,7 +192,8 @@ def diagnose(session: str | Path) -> DiagnosedImages:
         )
     assumed = opened.manifest.extra.get("assumed", [])
     lines = tuple(map(str, assumed)) if isinstance(assumed, list) else ()
-    return replace(recipe.diagnose(opened), assumed=lines)
+    found = recipe.diagnose(opened)
+    return replace(found, assumed=(*lines, *found.assumed))
 
 
 def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions) -> None:

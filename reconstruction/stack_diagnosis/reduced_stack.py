@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ class ReducedStack:
 
 
 def reduce_stack(
-    gray: NDArray[Any], usable: BoolArray | None, inside: BoolArray
+    gray: Sequence[NDArray[Any]] | NDArray[Any], usable: BoolArray | None, inside: BoolArray
 ) -> tuple[ReducedStack, Float64Array]:
     """Average blocks of pixels, image by image, and return each image's unusable fraction.
 

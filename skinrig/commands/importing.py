@@ -82,6 +82,7 @@ def import_photos(
             subject=person,
             framing=Framing.parse(crop, width),
             assumed=source.assumed,
+            video=source.video,
         )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)
@@ -264,6 +265,7 @@ def import_olat(
             mm_per_px=mm_per_px,
             subject=person,
             assumed=(*source.assumed, *found.assumed),
+            video=source.video,
         )
     console.print_each("assumed", done.assumed)
     console.print_line(

@@ -6,6 +6,8 @@ import pytest
 from fixtures.faulty_patterns import make_pair, make_state
 from fixtures.pattern_sessions import write_gradient_session, write_photographs
 
+from capture.importers import import_photos
+from capture.session import Session
 from model import store
 from skinrig.cli import main
 
@@ -71,6 +73,10 @@ def test_series_without_inverse_patterns_is_complete(images, tmp_path, capsys):
     code, found = diagnose(write_gradient_session(tmp_path / "t", turned), capsys)
     assert code == 1
     assert {one["fault"] for one in found["findings"]} == {"exchanged patterns"}
+    for one in found["findings"]:
+        named = [found["names"][number - 1].split() for number in one["images"]]
+        assert len({light for _, light, _ in named}) == 1
+        assert {pattern for _, _, pattern in named} == {"x", "y"}
 
 
 XY_PARALLEL = ("x", "parallel"), ("y", "parallel")
@@ -122,6 +128,21 @@ def test_imported_pair_and_its_maps_name_faults(fault, names, tmp_path, capsys):
 
 
 PHOTOGRAPHS = [(who, light) for who in ("anna", "ben") for light in ("parallel", "crossed")]
+
+
+def test_unnamed_polarizer_makes_no_pair(tmp_path, capsys):
+    pair = make_pair("", SEED)[:2]
+    folder = write_photographs(tmp_path / "f", {"anna": pair, "ben": pair})
+    (folder / "anna crossed.tif").rename(folder / "anna.tif")
+    session = tmp_path / "s"
+    assert main(["import", "photos", str(folder), "--out", str(session)]) == 0
+    assert len(Session.open(session).frames("subject", state="anna")) == 2
+    capsys.readouterr()
+    code, found = diagnose(session, capsys)
+    assert (code, found["names"]) == (0, ["ben parallel", "ben crossed"])
+    for file in folder.glob("ben*"):
+        file.unlink()
+    assert not import_photos(folder, out=tmp_path / "t").has_pairs
 
 
 def test_photographs_without_pairs_are_refused(tmp_path, capsys):

@@ -38,18 +38,28 @@ def diagnose_pairs(session: Session) -> DiagnosedImages:
     if not pairs:
         raise InputsError(
             f"{session.path}: got no state with a parallel and a crossed image of one size, "
-            "expected a polarized pair; without one, no images can be compared"
+            "expected a polarized pair, of photographs with both words in the names of the files; "
+            "without one, no images can be compared"
         )
     return collect_images(_diagnose_pair(session, pair) for pair in pairs)
 
 
 def list_pairs(session: Session) -> list[Pair]:
-    """Return the parallel and the crossed frame of each state and repeat that has both."""
+    """Return the parallel and the crossed frame of each camera, state and repeat that has both.
+
+    A photograph whose file names no polarizer counts as crossed by assumption: it is of no pair.
+    """
+    imported = "photographs" in session.manifest.extra
     by_index: dict[tuple[Any, ...], dict[str, FrameRecord]] = {}
     for record in session.frames("subject"):
-        key = tuple(sorted((k, v) for k, v in record.index.items() if k != "polarizer"))
+        if imported and "polarizer" not in record.settings:
+            continue
+        # views of photographs differ by setting, too, so that one pair can have two
+        camera = "" if imported else record.camera
+        key = camera, *sorted((k, v) for k, v in record.index.items() if k != "polarizer")
         by_index.setdefault(key, {})[str(record.index.get("polarizer"))] = record
-    pairs = [(one["parallel"], one["crossed"]) for one in by_index.values() if len(one) == 2]
+    both = {"parallel", "crossed"}
+    pairs = [(one["parallel"], one["crossed"]) for one in by_index.values() if both <= one.keys()]
     return [pair for pair in pairs if len({_describe_view(session, one) for one in pair}) == 1]
 
 

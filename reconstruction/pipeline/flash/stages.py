@@ -1,6 +1,6 @@
 """Stages of the flash rig: parallel and crossed frames to chromophores and displayed images."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture import raw
 from capture.calibration.color import ColorMatrix
 from capture.calibration.color.matrix import EXPOSURE_NOTE, EXPOSURE_UNKNOWN, describe_exposure
 from capture.calibration.color.matrix import from_calibration as color_matrix_from
 from capture.calibration.color.white import WhiteReference
 from capture.calibration.polarization import PolarizationCalibration
 from capture.calibration.sensor import SensorCalibration
-from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
 from capture.calibration.store import Calibration
 from capture.session import FrameRecord, Session
 from model import color_table
-from model.checks import Checks
 from model.color_table import ColorTable, with_exact_optics
 from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
@@ -34,6 +31,7 @@ from reconstruction.face_light import FaceLight, estimate_face_light
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.diagnosed_images import collect_images
 from reconstruction.pipeline.flash import oxygenation
+from reconstruction.pipeline.flash.mean_frames import FlashImage, make_image_reader
 from reconstruction.pipeline.flash.pair_diagnosis import diagnose_pair
 from reconstruction.pipeline.flash.skin_stage import find_imported_face, skin_stage
 from reconstruction.pipeline.inputs import Inputs, InputsError
@@ -41,7 +39,7 @@ from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.pipeline.skin_tone import maps as tone
 from reconstruction.pipeline.skin_tone.maps import SkinReflectance
 
-STAGE_REVISION = 12
+STAGE_REVISION = 13
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = (
@@ -53,15 +51,6 @@ MAP_NAMES = (
     "oxygenation_noise_stderr",
 )
 """Maps of a flash session."""
-
-
-@dataclass(frozen=True, slots=True)
-class FlashImage:
-    """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
-
-    rgb: Float32Array
-    variance: Float32Array
-    valid: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +114,12 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
             stage, (rig.color, rig.neutral), refused="" if rig.has_white else NEEDS_WHITE, **table
         ),
         oxygenation.oxygenation_stage(
-            stage, rig.session, partial(_image_reader, rig), rig.white, which=which, **table
+            stage,
+            rig.session,
+            partial(make_image_reader, rig.session, rig.sensor),
+            rig.white,
+            which=which,
+            **table,
         ),
     ]
 
@@ -197,7 +191,7 @@ def load_skin_colors(
 def _frames(rig: FlashRig) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the dark frames."""
     session, state, repeat = rig.session, rig.inputs.state, rig.inputs.repeat
-    mean_image = _image_reader(rig)
+    mean_image = make_image_reader(rig.session, rig.sensor)
     images: dict[str, FlashImage | None] = {}
     for polarizer in ("parallel", "crossed"):
         which: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
@@ -225,63 +219,16 @@ def _diagnose(rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage) -
     groups = []
     if parallel is not None and parallel.rgb.shape == crossed.rgb.shape:
         usable = parallel.valid & crossed.valid
-        neutral = rig.session.read(rig.session.frames("subject", state=rig.inputs.state)[0]).neutral
         names = [f"{rig.inputs.state} {polarizer}" for polarizer in ("parallel", "crossed")]
-        groups.append(diagnose_pair(parallel.rgb, crossed.rgb, usable, neutral, names))
+        groups.append(diagnose_pair(parallel.rgb, crossed.rgb, usable, parallel.neutral, names))
     collect_images(groups).record_in(rig.inputs)
-
-
-def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:
-    """Return a function that averages frames of one polarizer state and subtracts dark frames."""
-    session = rig.session
-    demosaic: raw.Demosaic = "superpixel" if session.manifest.has_developed_images else "centered"
-    gain, read_noise = _noise(rig.sensor)
-
-    def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
-        known: dict[str, Any] = {"demosaic": demosaic, "gain": gain, "read_noise": read_noise}
-        return [raw.linear_rgb(session.read(record), **known) for record in records]
-
-    def total(images: list[raw.LinearImage], name: str) -> NDArray[Any]:
-        parts = [getattr(image, name) for image in images]
-        return np.asarray(np.sum(parts, axis=0, dtype=np.float64))
-
-    darks = linear_light(session.frames("dark"))
-    count = max(len(darks), 1)
-    dark = total(darks, "rgb") / count
-    dark_variance = total(darks, "variance") / count / count
-
-    def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
-        linear = linear_light(records)
-        sizes = {image.rgb.shape for image in linear}
-        name = records[0].index.get("polarizer") or records[0].index["light"]
-        expected = "one camera setting; choose frames of one"
-        Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
-        power = sum(float(record.settings.get("power", 1.0)) for record in records)
-        rgb = total(linear, "rgb") - len(linear) * dark
-        variance = total(linear, "variance") + len(linear) ** 2 * dark_variance
-        return FlashImage(
-            (rgb / power).astype(np.float32),
-            (variance / power**2).astype(np.float32),
-            np.logical_and.reduce([image.valid for image in linear]),
-        )
-
-    return mean_image
 
 
 def separate_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
     """Yield the diffuse reflectance of each crossed frame alone."""
-    mean_image = _image_reader(rig)
+    mean_image = make_image_reader(rig.session, rig.sensor)
     for record in records:
         yield _separate(rig, "diffuse", None, mean_image([record]))["diffuse"]
-
-
-def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return a calibration's gain (electrons per DN) and read noise with rounding, or None."""
-    if sensor is None:
-        return None, None
-    gain = float(sensor.mean_gain_e_per_dn().value)
-    read = float(sensor.mean_read_noise_e().value)
-    return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
 
 
 def _separate(

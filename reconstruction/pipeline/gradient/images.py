@@ -149,14 +149,13 @@ class GradientImages:
             if key[0] == "dark":
                 continue
             mean, spread, good = self._mean(records)
-            if dark is not None:
-                mean = mean - dark
-            values[key] = mean
+            sizes = {one.shape for one in (mean, dark, valid) if one is not None}
+            if len(sizes) > 1:
+                hint = f"got {sorted(sizes)}, expected one size; capture the state again"
+                raise InputsError(f"state {state.name}: its frames differ in size; {hint}")
+            values[key] = mean if dark is None else mean - dark
             variance[key] = spread + np.float32(self._dark_variance)
             valid = good if valid is None else valid & good
-            if mean.shape != next(iter(values.values())).shape:
-                hint = "capture the state again"
-                raise InputsError(f"state {state.name}: its frames differ in size; {hint}")
         if valid is None:
             got = "got no lit image, expected at least one"
             raise InputsError(f"state {state.name}: {got}; capture the state again")
@@ -169,6 +168,9 @@ class GradientImages:
         frames = (raw.linear_mono(self._session.read(record), **noise) for record in records)
         total, variance, valid = next(frames)
         for value, spread, good in frames:
+            if value.shape != total.shape:
+                got = f"got repeats of {total.shape} and {value.shape} pixels"
+                raise InputsError(f"a pattern: {got}, expected one size; capture the state again")
             total, variance, valid = total + value, variance + spread, valid & good
         count = np.float32(len(records))
         return total / count, variance / count**2, valid

@@ -19,6 +19,7 @@ from reconstruction.pipeline.diagnosed_images import (
 )
 from reconstruction.pipeline.gradient.images import GradientImages, Key, StatePatterns
 from reconstruction.pipeline.gradient.skin_strain import skin_mask
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.stack_diagnosis import Finding
 from reconstruction.stack_diagnosis.pattern_faults import (
     PATTERN_NAMES,
@@ -39,18 +40,29 @@ def diagnose_patterns(session: Session) -> DiagnosedImages:
     Raises
     ------
     InputsError
-        If the session has no neutral strain step, or one without lit images.
+        If the session has no neutral strain step, or none that can be judged.
     """
-    return diagnose_states(GradientImages(session), session)
+    found = diagnose_states(GradientImages(session), session)
+    if not found.names:
+        raise InputsError(f"{session.path}: {'; '.join(found.assumed)}")
+    return found
 
 
 def diagnose_states(images: GradientImages, session: Session) -> DiagnosedImages:
-    """Return the diagnosis of all strain steps, with images that are already open."""
+    """Return the diagnosis of all strain steps, with images that are already open.
+
+    A step that cannot be judged is left out; `DiagnosedImages.assumed` then states why.
+    """
     planned = list_planned_patterns(session)
-    return collect_images(
-        diagnose_state(images.of(state), planned.get(state.name, ()), name=state.name)
-        for state in images.states
-    )
+    groups, skipped = [], []
+    for state in images.states:
+        try:
+            patterns = images.of(state)
+        except InputsError as error:
+            skipped.append(f"the patterns of {state.name} were not compared: {error}")
+            continue
+        groups.append(diagnose_state(patterns, planned.get(state.name, ()), name=state.name))
+    return replace(collect_images(groups), assumed=tuple(skipped))
 
 
 def list_planned_patterns(session: Session) -> dict[str, tuple[Key, ...]]:
@@ -82,7 +94,7 @@ def diagnose_state(patterns: StatePatterns, planned: Sequence[Key], *, name: str
     keys = list(dict.fromkeys([*patterns.values, *(key for key in planned if key[0] != "dark")]))
     has_crossed = any(light == "crossed" for _, light in patterns.values)
     mask = patterns.valid & skin_mask(patterns.crossed()) if has_crossed else patterns.valid
-    stack, _ = reduce_stack(np.stack(list(patterns.values.values())), None, mask)
+    stack, _ = reduce_stack(list(patterns.values.values()), None, mask)
     images = dict(zip(patterns.values, stack.gray, strict=True))
     shown = [images.get(key, np.zeros(stack.inside.shape)) for key in keys]
     findings = []
@@ -98,7 +110,9 @@ def diagnose_state(patterns: StatePatterns, planned: Sequence[Key], *, name: str
         expected = [pattern for pattern, other in keys if other == light]
         found = find_pattern_faults(own, stack.inside, expected=expected) if own else ()
         at = [keys.index(key) if (key := (p, light)) in keys else -1 for p in PATTERN_NAMES]
-        findings += renumber(found, at)
+        # faults of axes name inverse patterns, too, which some series do not have
+        there = [replace(one, frames=tuple(k for k in one.frames if at[k] >= 0)) for one in found]
+        findings += renumber(there, at)
     return ImageGroup(findings, [f"{name} {light} {pattern}" for pattern, light in keys], shown)
 
 

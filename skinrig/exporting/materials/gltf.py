@@ -2,8 +2,8 @@
 
 As the standard requires, lengths are in meters and v increases downwards. glTF has no subsurface
 scattering; sigma_tr is written to ``extras``, and a variant of the material transmits light through
-the body. Programs without the extension of diffuse transmission show the other materials, whose
-base color is complete.
+the body. The other materials, whose base color is complete, show unless somebody selects it. A
+program with variants but without diffuse transmission then shows its base color, too bright.
 
 References
 ----------
@@ -170,7 +170,8 @@ def write(
 
 TRANSLUCENT_NOTE: Final = (
     "light through the body by KHR_materials_diffuse_transmission; the base color is divided by "
-    "the part that is not transmitted"
+    "the part that is not transmitted, so that programs without this extension show it too bright: "
+    "select another variant in them"
 )
 
 

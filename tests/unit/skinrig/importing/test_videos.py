@@ -1,12 +1,15 @@
 """Videos are imported as folders of their frames, with what compression loses."""
 
+import hashlib
 import json
+import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from capture.importers import read_photo, video_frames
+from capture.importers import PhotoError, photos, read_photo, video_frames
 from capture.importers.image_stacks import encode_srgb
 from capture.importers.light_lists import to_gray
 from capture.importers.video_frames import open_source
@@ -74,6 +77,7 @@ def test_video_under_listed_lights_is_imported_and_diagnosed(images, lights, tmp
     printed = capsys.readouterr().out
     assert "assumed: the frames were compressed (MJPG" in printed
     assert len(Session.open(session).frames()) == COUNT
+    assert Session.open(session).manifest.extra["video"] == describe(video, COUNT)
     assert main(["diagnose", str(session), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["findings"] == []
@@ -89,6 +93,62 @@ def test_frames_of_video_become_photographs(images, tmp_path, capsys):
     session = Session.open(tmp_path / "s")
     assert [record.index["state"] for record in session.frames()] == ["00001", "00002"]
     assert "compressed (MJPG" in session.manifest.extra["assumed"][0]
+    assert session.manifest.extra["video"] == describe(video, 2)
+
+
+def describe(video, count):
+    digest = hashlib.sha256(video.read_bytes()).hexdigest()
+    about = {"name": "a.avi", "sha256": f"sha256:{digest}", "codec": "MJPG"}
+    return about | {"stated_frames": count, "decoded_frames": count}
+
+
+def test_errors_of_frames_name_the_video(images, lights, tmp_path, capsys, monkeypatch):
+    video = write_video(tmp_path / "a.avi", images[:3])
+
+    def read_all_but_second(file, **options):
+        if file.name == "00002.png":
+            raise PhotoError("is black", where=str(file))
+        return read_photo(file, **options)
+
+    monkeypatch.setattr(photos, "read_photo", read_all_but_second)
+    assert main(["import", "photos", str(video), "--out", str(tmp_path / "s")]) == 3
+    printed = capsys.readouterr().err
+    assert f"{video}: 1 of 3 files cannot be imported" in printed
+    assert "frame 2: got one that is black" in printed
+    assert "Cut these frames out; nothing was written." in printed
+    assert ".png" not in printed
+    rows = "\n".join(" ".join(map(str, row)) for row in lights[:2])
+    (tmp_path / "lights.txt").write_text(rows)
+    argv = ["import", "olat", str(video), "--lights", str(tmp_path / "lights.txt")]
+    assert main([*argv, "--out", str(tmp_path / "t")]) == 3
+    assert "skinrig-" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("make", [lambda text: PhotoError("is bad", where=text), ValueError])
+def test_paths_of_frames_become_numbers(make, images, tmp_path):
+    video = write_video(tmp_path / "a.avi", images[:2])
+    with (
+        pytest.raises(ValueError, match=r"a\.avi, frame 2") as caught,
+        open_source(video) as source,
+    ):
+        raise make(f"{source.path / '00002.png'}")
+    assert "skinrig-" not in str(caught.value)
+    assert ".png" not in str(caught.value)
+
+
+def test_video_without_space_is_refused(images, tmp_path, capsys, monkeypatch):
+    video = write_video(tmp_path / "a.avi", images)
+    free = shutil.disk_usage(tmp_path)._replace(free=2000)
+    monkeypatch.setattr(video_frames, "shutil", SimpleNamespace(disk_usage=lambda _: free))
+    written = []
+    write = cv2.imwrite
+    monkeypatch.setattr(cv2, "imwrite", lambda *args: written.append(1) or write(*args))
+    assert main(["import", "photos", str(video), "--out", str(tmp_path / "s")]) == 3
+    printed = capsys.readouterr().err
+    assert "too little space" in printed
+    assert f"for {COUNT} frames" in printed
+    assert "TMPDIR" in printed
+    assert len(written) == 1
 
 
 def test_unreadable_or_long_video_is_refused(images, tmp_path, capsys, monkeypatch):
