@@ -202,7 +202,7 @@ def _not_decodable(where: str, got: str) -> PhotoError:
         where=where,
         faults=[Fault("video", got, "frames of MP4, AVI or MOV")],
         advice=FRAMES_ADVICE,
-        code="SR-IMP-017",
+        code="SR-IMP-018",
     )
 
 

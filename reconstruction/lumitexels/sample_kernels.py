@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from reconstruction.lumitexels.boundary_kernels import boundary_reflectance
 
-BLOCK = 16
+BLOCK_POINTS = 16
 """Points that a thread transposes at once: 64 bytes of float32."""
 
 
@@ -60,9 +60,9 @@ def shade(samples, normals, limits, eta, out):  # type: ignore[no-untyped-def]
     least_light, least_view, most_half = limits
     signal, spread, used = out
     points, count, channels = f.shape
-    for block in prange((points + BLOCK - 1) // BLOCK):
+    for block in prange((points + BLOCK_POINTS - 1) // BLOCK_POINTS):
         for m in range(count):
-            for p in range(block * BLOCK, min(points, (block + 1) * BLOCK)):
+            for p in range(block * BLOCK_POINTS, min(points, (block + 1) * BLOCK_POINTS)):
                 cl = cv = length2 = 0.0
                 for c in range(3):
                     cl += light_dir[p, m, c] * normals[p, c]

@@ -29,7 +29,7 @@ from reconstruction.stack_diagnosis.pattern_faults import (
 from reconstruction.stack_diagnosis.polarized_pairs import find_pair_faults
 from reconstruction.stack_diagnosis.reduced_stack import reduce_stack
 
-POLARIZERS = ("parallel", "crossed")
+POLARIZER_NAMES = ("parallel", "crossed")
 MAX_MISFIT_RATIO = 0.5
 """Ratio of the sums' errors with and without an exchange of polarizers, below which it is right."""
 
@@ -102,10 +102,10 @@ def diagnose_state(patterns: StatePatterns, planned: Sequence[Key], *, name: str
     if exchanged is not None:
         swapped, one = exchanged
         findings = renumber(
-            [one], [keys.index((p, light)) for p in swapped for light in POLARIZERS]
+            [one], [keys.index((p, light)) for p in swapped for light in POLARIZER_NAMES]
         )
         images = _exchange(images, swapped)
-    for light in POLARIZERS:
+    for light in POLARIZER_NAMES:
         own = {pattern: image for (pattern, other), image in images.items() if other == light}
         expected = [pattern for pattern, other in keys if other == light]
         found = find_pattern_faults(own, stack.inside, expected=expected) if own else ()
@@ -124,10 +124,12 @@ def _find_exchanged(
     Its frames count the parallel and the crossed image of each of these patterns. A pattern that is
     exchanged with another one can look alike, but only the right exchange makes the sums right.
     """
-    both = [name for name in PATTERN_NAMES if all((name, light) in images for light in POLARIZERS)]
+    both = [
+        name for name in PATTERN_NAMES if all((name, light) in images for light in POLARIZER_NAMES)
+    ]
     found: dict[str, Finding] = {}
     for pattern in both:
-        pair = [images[pattern, light] for light in POLARIZERS]
+        pair = [images[pattern, light] for light in POLARIZER_NAMES]
         for one in find_pair_faults(pair[0], pair[1], inside):
             found[pattern] = one  # gray images can only be exchanged
     if not found:
@@ -160,7 +162,7 @@ def _exchange(
     images: Mapping[Key, Float64Array], patterns: Sequence[str]
 ) -> dict[Key, Float64Array]:
     """Return the images with the two polarizations of some patterns exchanged."""
-    other = dict(zip(POLARIZERS, POLARIZERS[::-1], strict=True))
+    other = dict(zip(POLARIZER_NAMES, POLARIZER_NAMES[::-1], strict=True))
     return {
         (name, other[light] if name in patterns else light): one
         for (name, light), one in images.items()
@@ -171,7 +173,7 @@ def _sum_misfit(
     images: Mapping[Key, Float64Array], inside: BoolArray, patterns: Sequence[str]
 ) -> float:
     """Return the root mean square error of these patterns' sums in both polarizations."""
-    by_light: dict[str, dict[str, Float64Array]] = {light: {} for light in POLARIZERS}
+    by_light: dict[str, dict[str, Float64Array]] = {light: {} for light in POLARIZER_NAMES}
     for (name, light), one in images.items():
         by_light[light][name] = one
     found = [measure_sum_misfit(own, inside, patterns=patterns) for own in by_light.values()]

@@ -56,7 +56,7 @@ MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histo
 STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE = "strain.json", "histograms.json", "kernels.json"
 FILE_NAMES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
-DIAGNOSED = "_diagnosed"
+FAULT_LOG = "_diagnosed"
 """Product of the stage that judges the patterns before any map is made of them."""
 CUTOFF_UM = 1000.0
 """Longest wavelength of the surface topography (Nagano et al. 2015, section 4)."""
@@ -129,10 +129,10 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     kernels = partial(_kernels, inputs, rig)
     strain, facets = partial(_strain, inputs, rig), partial(_facets, inputs, rig)
     made = [
-        stage("diagnosis", "", DIAGNOSED, partial(_diagnose, inputs, rig)),
-        stage("strain", DIAGNOSED, f"_strains {STRAIN_FILE}", _diagnosed(strain)),
-        stage("facets", DIAGNOSED, "_facets", _diagnosed(facets)),
-        stage(f"diffuse normals {neutral}", DIAGNOSED, diffuse, _diagnosed(partial(_diffuse, rig))),
+        stage("diagnosis", "", FAULT_LOG, partial(_diagnose, inputs, rig)),
+        stage("strain", FAULT_LOG, f"_strains {STRAIN_FILE}", _diagnosed(strain)),
+        stage("facets", FAULT_LOG, "_facets", _diagnosed(facets)),
+        stage(f"diffuse normals {neutral}", FAULT_LOG, diffuse, _diagnosed(partial(_diffuse, rig))),
         stage(
             "histograms", f"_strains _facets {heights} {noises}", counted, partial(_histograms, rig)
         ),
@@ -143,7 +143,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         normals, height = partial(_normals, rig, state), partial(_height, rig, state)
         crossed = partial(_crossed, rig, state)
         made += [
-            stage(f"crossed {name}", DIAGNOSED, f"crossed_{name}", _diagnosed(crossed)),
+            stage(f"crossed {name}", FAULT_LOG, f"crossed_{name}", _diagnosed(crossed)),
             stage(f"normals {name}", "_facets", f"normals_{name} {restored}", normals),
             stage(f"height {name}", restored, f"height_{name} _slope_noise_{name}", height),
         ]
@@ -224,7 +224,7 @@ def _diagnosed(run: Callable[..., Any]) -> Callable[..., Any]:
     """Return a stage's function that runs after the diagnosis, which marks its maps."""
 
     def run_after(**made: Any) -> Any:
-        return run(**{name: value for name, value in made.items() if name != DIAGNOSED})
+        return run(**{name: value for name, value in made.items() if name != FAULT_LOG})
 
     return run_after
 

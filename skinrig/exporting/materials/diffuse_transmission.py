@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from model import fresnel
 from skinrig.arrays import Float64Array
 
-EXTENSIONS = ("KHR_materials_diffuse_transmission", "KHR_materials_volume")
+TRANSMISSION_EXTENSIONS = ("KHR_materials_diffuse_transmission", "KHR_materials_volume")
 MIN_DEFICIT, MAX_DEFICIT = 1e-9, 0.999
 MM_PER_M = 1e3
 

@@ -32,7 +32,7 @@ from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
 from skinrig.exporting.materials.diffuse_transmission import (
-    EXTENSIONS,
+    TRANSMISSION_EXTENSIONS,
     DiffuseTransmission,
     amplitude,
 )
@@ -281,7 +281,7 @@ def _add_variants(
     mappings = [{"material": k, "variants": [k]} for k in range(len(every))]
     surface.extensions = {VARIANTS_EXTENSION: {"mappings": mappings}}
     file.extensions = {VARIANTS_EXTENSION: {"variants": [{"name": name} for name in every]}}
-    file.extensionsUsed = [*file.extensionsUsed, VARIANTS_EXTENSION, *EXTENSIONS]
+    file.extensionsUsed = [*file.extensionsUsed, VARIANTS_EXTENSION, *TRANSMISSION_EXTENSIONS]
 
 
 def _pictures(

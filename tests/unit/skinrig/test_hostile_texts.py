@@ -90,7 +90,7 @@ def test_text_in_csv_is_not_a_formula(text):
     assert cells == ["'" + text.replace("\r", " "), "-1.5", "-1.5", "a=b"]
 
 
-def test_text_in_csv_is_not_a_formula_after_other_separators():
+def test_text_after_semicolon_is_not_a_formula():
     assert format_csv([("a;=1", "b; @x", "c-d")]) == "a;'=1,b; '@x,c-d\n"
 
 
