@@ -323,7 +323,7 @@ def _calibrated_dome(rig: Rig, images: DomeImages) -> CalibratedDome:
         lights,
         response,
         True,
-        lambda _, tiles, compute: map(compute, tiles),
+        lambda _, tiles, compute, **_given: map(compute, tiles),
     )
 
 

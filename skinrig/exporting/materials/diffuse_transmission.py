@@ -128,7 +128,7 @@ def amplitude(deficit: ArrayLike, eta: float) -> Float64Array:
     Examples
     --------
     >>> amplitude([0.01, 0.1, 0.5], 1.4).round(3).tolist()
-    [0.744, 0.553, 0.18]
+    [0.577, 0.824, 0.855]
     """
     lost = np.clip(np.asarray(deficit, np.float64), MIN_DEFICIT, MAX_DEFICIT)
     s = np.sqrt(3.0 * lost)  # sigma_tr in units of sigma_t'
