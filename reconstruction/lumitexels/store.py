@@ -18,7 +18,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from model.checks import Checks
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
     MIN_VISIBLE_COSINE,
@@ -194,33 +194,37 @@ class LumitexelStore:
         part = (start, stop)
         if part in self._kept:
             return self._kept[part]
-        found = self._chunk(start, stop)
+        found = self._samples(slice(start, stop))
         with self._lock:  # several threads read chunks at once
             samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
             if BYTES_PER_SAMPLE * samples <= self._kept_bytes:
                 self._kept[part] = found
         return found
 
-    def _chunk(self, start: int, stop: int) -> Lumitexels:
-        count, views, lights = stop - start, len(self._cameras), self.light_count
-        points = self.surface.points_mm[start:stop].astype(np.float64)
-        normals = self.surface.normals[start:stop]
+    def points(self, indices: NDArray[np.integer]) -> Lumitexels:
+        """Return the lumitexels of the points of ascending indices, shape (P,)."""
+        return self._samples(np.asarray(indices))
+
+    def _samples(self, part: slice | NDArray[np.integer]) -> Lumitexels:
+        points = self.surface.points_mm[part].astype(np.float64)
+        normals = self.surface.normals[part]
+        count, views, lights = len(points), len(self._cameras), self.light_count
         f = np.zeros((count, views, lights, 3), np.float32)
         variance = np.full((count, views, lights, 3), np.inf, np.float32)
         light_dir = np.empty((count, views, lights, 3), np.float32)
         view_dir = np.empty((count, views, lights, 3), np.float32)
         cosines = np.empty((2, count, views, lights), np.float32)
         valid = np.zeros((count, views, lights), np.bool_)
-        lit = np.unpackbits(self._lit[:, start:stop], axis=0, bitorder="little", count=lights)
+        lit = np.unpackbits(self._lit[:, part], axis=0, bitorder="little", count=lights)
         geometry: tuple[FloatArray, FloatArray] | None = None
         for view in range(views):
             if geometry is None or self._differs_by_view():
                 geometry = self._light_geometry(view, points)
-            first, last = np.searchsorted(self._rows[view], (start, stop))
+            columns, places = _find_columns(self._rows[view], part)
             _assemble(
-                np.asarray(self._tables[view][:, :, first:last]).astype(np.float32),
+                np.asarray(self._tables[view][:, :, columns]).astype(np.float32),
                 self._scale[view],
-                self._rows[view][first:last] - start,
+                places,
                 lit,
                 *geometry,
                 self._view_geometry(view, points),
@@ -265,6 +269,17 @@ class LumitexelStore:
         way = center[:, None] - points[None]
         way /= np.linalg.norm(way, axis=-1, keepdims=True)
         return np.ascontiguousarray(way, np.float32)
+
+
+def _find_columns(
+    rows: Int32Array, part: slice | NDArray[np.integer]
+) -> tuple[slice | NDArray[np.integer], Int32Array]:
+    """Return a table's columns of the points that its camera sees, and their places in the part."""
+    if isinstance(part, slice):
+        first, last = np.searchsorted(rows, (part.start, part.stop))
+        return slice(first, last), rows[first:last] - np.int32(part.start)
+    _, places, columns = np.intersect1d(part, rows, assume_unique=True, return_indices=True)
+    return columns, places.astype(np.int32)
 
 
 def _table(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -66,6 +67,12 @@ class PointValues:
         """Return estimates that are 0 where not valid."""
         keep = valid[:, None]
         return PointValues(np.where(keep, values, 0.0), np.where(keep, stderr, 0.0), valid)
+
+    @staticmethod
+    def concatenate(parts: Sequence[PointValues]) -> PointValues:
+        """Return the estimates of the points of all parts, in order."""
+        arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
+        return PointValues(*map(np.concatenate, arrays))
 
     def __getitem__(self, rows: slice | NDArray[np.integer]) -> PointValues:
         """Return the estimates of some of the points."""
@@ -314,7 +321,7 @@ def normals_from_full_model(
     return PointValues(values, stderr, normals.valid)
 
 
-def count_samples(part: slice, samples: Lumitexels) -> PointValues:
+def count_samples(samples: Lumitexels) -> PointValues:
     """Return the number of samples of each point; valid where an estimate is possible."""
     counts = samples.counts[:, None].astype(np.float64)
     return PointValues(counts, np.zeros_like(counts), has_enough_samples(samples))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from model.checks import Checks
 from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
-from reconstruction.arrays import Float64Array, Int64Array
+from reconstruction.arrays import Float64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline.dome.calibrated import CalibratedDome
@@ -69,21 +69,19 @@ class SurfaceSampleStore:
     compute_tiles: Callable[..., Iterator[Any]]
     """See `reconstruction.pipeline.inputs.Inputs.compute_tiles`."""
 
-    def parts(self) -> list[slice]:
-        """Return parts of the points with at most `CHUNK_SAMPLES` samples each."""
+    def parts(self, points: int) -> list[slice]:
+        """Return parts of so many points with at most `CHUNK_SAMPLES` samples each."""
         samples_per_point = max(self.store.light_count * self.store.view_count, 1)
         size = max(1, CHUNK_SAMPLES // samples_per_point)
-        total = len(self.store.surface)
-        return [slice(start, min(start + size, total)) for start in range(0, total, size)]
-
-    def samples(self, part: slice) -> Lumitexels:
-        """Return the samples of a part."""
-        return self.store.chunk(part.start, part.stop)
+        return [slice(start, min(start + size, points)) for start in range(0, points, size)]
 
     def collect(
-        self, stage: str, estimate: Callable[[slice, Lumitexels], PointValues]
-    ) -> PointValues:
-        """Estimate part by part and concatenate the results.
+        self, stage: str, estimate: Callable[[slice, Lumitexels], Sequence[PointValues]]
+    ) -> list[PointValues]:
+        """Estimate part by part and concatenate each of the results.
+
+        Assembling the samples of a part costs as much as an estimate: estimates that depend on
+        nothing but their own points belong into one pass.
 
         Parameters
         ----------
@@ -93,13 +91,13 @@ class SurfaceSampleStore:
             Called with the points of a part and their samples.
         """
 
-        def of_part(part: slice) -> PointValues:
-            samples = self.samples(part)
+        def of_part(part: slice) -> Sequence[PointValues]:
+            samples = self.store.chunk(part.start, part.stop)
             return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
 
-        parts = list(self.compute_tiles(stage, self.parts(), of_part, workers=MAX_WORKERS))
-        arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
-        return PointValues(*map(np.concatenate, arrays))
+        parts = self.parts(len(self.store.surface))
+        found = self.compute_tiles(stage, parts, of_part, workers=MAX_WORKERS)
+        return [PointValues.concatenate(each) for each in zip(*found, strict=True)]
 
 
 def fit_lobes(
@@ -108,7 +106,7 @@ def fit_lobes(
     point_normals: PointValues,
     point_r_d: PointValues,
 ) -> Mapping[str, Any]:
-    """Fit basis BRDFs to all points, reduce them to the rank; return basis, weights and file."""
+    """Fit basis BRDFs to some points and reduce them to the rank; return basis and file."""
     folder = inputs.basis
     materials = brdf_tables.default_basis() if folder is None else brdf_tables.load(folder)
     rank = inputs.rank or BASIS_RANK
@@ -120,16 +118,13 @@ def fit_lobes(
         )
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
 
-    def drawn_in(part: slice) -> Int64Array:
-        return drawn[(drawn >= part.start) & (drawn < part.stop)]
-
     def fit_drawn(part: slice) -> Float64Array:
-        points = drawn_in(part)
-        some = estimates.select_points(lumitexels.samples(part), points - part.start)
+        points = drawn[part]
+        some = lumitexels.store.points(points)
         shine = estimates.specular_samples(some, point_normals[points], point_r_d[points])
         return brdf_basis.fit_weights(shine, materials).weights
 
-    parts = [part for part in lumitexels.parts() if len(drawn_in(part))]
+    parts = lumitexels.parts(len(drawn))
     fitted = list(
         lumitexels.compute_tiles("mixtures of materials", parts, fit_drawn, workers=MAX_WORKERS)
     )
@@ -146,17 +141,7 @@ def fit_lobes(
         if k <= most
     }
     basis = materials.mix_materials(mixes[rank][0])
-    found = lumitexels.collect(
-        "lobes",
-        lambda part, samples: estimates.fit_lobe_weights(
-            samples, point_normals[part], point_r_d[part], basis
-        ),
-    )
-    return {
-        "basis": basis,
-        "weights": found.values[:, :rank],
-        "basis_file": _basis_bytes(materials, rank, mixes),
-    }
+    return {"basis": basis, "basis_file": _basis_bytes(materials, rank, mixes)}
 
 
 def _normalize_mixtures(
@@ -202,43 +187,37 @@ def refine_normals(
     point_normals: PointValues,
     point_r_d: PointValues,
     basis: BrdfBasis,
-    weights: Float64Array,
     basis_file: bytes,
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap | bytes]:
-    """Refine normals and lobe weights alternately; return them as maps with the basis's file."""
-    lobes = PointLobes(weights, basis)
-    started = lumitexels.collect(
-        "normals from the residual of the lobes",
-        lambda part, samples: estimates.normals_from_remainder(
-            samples, point_normals[part], point_r_d[part], lobes[part]
-        ),
-    )
-    known = point_normals.valid & point_r_d.valid
-    moved = started.valid[:, None]
-    values = np.where(moved, started.values, point_normals.values)
-    inside = PointValues(values, np.where(moved, started.stderr, point_normals.stderr), known)
-    found, rank = inside, weights.shape[1]
-    for turn in range(N_REFINEMENTS):
-        of_turn = f"{turn + 1} of {N_REFINEMENTS}"
-        found = lumitexels.collect(
-            f"normals from the full model, {of_turn}",
-            lambda part, samples, n=found.values, own=lobes: estimates.normals_from_full_model(  # type: ignore[misc]
-                samples, inside[part], point_r_d[part], own[part], initial_normals=n[part]
-            ),
-        )
-        fitted = lumitexels.collect(
-            f"lobes, {of_turn}",
-            lambda part, samples, n=found: estimates.fit_lobe_weights(  # type: ignore[misc]
-                samples, n[part], point_r_d[part], basis
-            ),
-        )
-        lobes = PointLobes(fitted.values[:, :rank], basis)
+    """Refine normals and lobe weights alternately, point by point; return maps and basis file."""
+
+    def refine(part: slice, samples: Lumitexels) -> tuple[PointValues, PointValues]:
+        first, r_d = point_normals[part], point_r_d[part]
+
+        def fit(normals: PointValues) -> tuple[PointValues, PointLobes]:
+            fitted = estimates.fit_lobe_weights(samples, normals, r_d, basis)
+            return fitted, PointLobes(fitted.values[:, :-1], basis)
+
+        fitted, lobes = fit(first)
+        started = estimates.normals_from_remainder(samples, first, r_d, lobes)
+        moved = started.valid[:, None]
+        values = np.where(moved, started.values, first.values)
+        stderr = np.where(moved, started.stderr, first.stderr)
+        found = inside = PointValues(values, stderr, first.valid & r_d.valid)
+        for _ in range(N_REFINEMENTS):
+            found = estimates.normals_from_full_model(
+                samples, inside, r_d, lobes, initial_normals=found.values
+            )
+            fitted, lobes = fit(found)
+        return found, fitted
+
+    found, fitted = lumitexels.collect("normals and lobes from the full model", refine)
     maps, good, what = {}, fitted.valid, "weight of a common mixture"
-    for k, name in enumerate(weight_names(rank)):
+    for k, name in enumerate(weight_names(fitted.values.shape[1] - 1)):
         maps[name] = texture.map(fitted.values[:, k], fitted.stderr[:, k], good, "1", what)
     what = "weighted RMS of samples - model"
-    maps["lobe_residual"] = texture.map(fitted.values[:, rank], None, good, "1/sr", what)
+    maps["lobe_residual"] = texture.map(fitted.values[:, -1], None, good, "1/sr", what)
     found = surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
     refined = texture.normals(found, "by the full model, world frame")
     return {BASIS_FILE: basis_file, "normals_refined": refined, **maps}

@@ -93,7 +93,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     )
     refused = "" if dome.absolute else unscaled
     seen, turned = "surface lumitexels texture", "surface lumitexels point_normals texture"
-    lit, lobes = "lumitexels point_normals point_r_d", "basis weights basis_file"
+    lit, lobes = "lumitexels point_normals point_r_d", "basis basis_file"
     refined = f"normals_refined {weights} lobe_residual {BASIS_FILE}"
     view, light = inputs.session.rig.views[0], inputs.session.rig.lights[0]
     spectra = {"camera": view.spectral_sensitivity, "illuminant": light.illuminant}
@@ -102,9 +102,8 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
         stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
         stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, inputs, dome)),
-        stage("sample counts", "lumitexels texture", "samples", _counts),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
-        stage("normals", seen, "point_normals normals", partial(_normals, dome)),
+        stage("normals", seen, "point_normals normals samples", partial(_normals, dome)),
         stage("albedo", turned, "point_r_d r_d", partial(_albedo, dome), refused),
         stage(
             "lobes", lit, lobes, partial(fit_lobes, inputs), rank=rank, ranks=list(RECORDED_RANKS)
@@ -276,14 +275,9 @@ def sample_surface(
     return SurfaceSampleStore(store, keeper, len(dome.table.names), dome.compute_tiles)
 
 
-def _counts(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
-    found = lumitexels.collect("sample counts", estimates.count_samples)
-    return texture.map(found.values[:, 0], None, found.valid, "1", "samples per point")
-
-
 def _half_vectors(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
-    found = lumitexels.collect(
-        "half-vector normals", lambda _, samples: estimates.normals_from_half_vectors(samples)
+    (found,) = lumitexels.collect(
+        "half-vector normals", lambda _, samples: [estimates.normals_from_half_vectors(samples)]
     )
     return texture.normals(found, "as published, world frame")
 
@@ -294,19 +288,24 @@ def _normals(
     lumitexels: SurfaceSampleStore,
     texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
-    found = measure_normals(dome, surface, lumitexels)
-    return {"point_normals": found, "normals": texture.normals(found, "world frame")}
+    found, counts = measure_normals(dome, surface, lumitexels)
+    samples = texture.map(counts.values[:, 0], None, counts.valid, "1", "samples per point")
+    normals = texture.normals(found, "world frame")
+    return {"point_normals": found, "normals": normals, "samples": samples}
 
 
 def measure_normals(
     dome: CalibratedDome, surface: RefinedScan, lumitexels: SurfaceSampleStore
-) -> PointValues:
-    """Estimate the normals at a surface's points, with all of their errors."""
-    found = lumitexels.collect(
+) -> tuple[PointValues, PointValues]:
+    """Estimate the normals at a surface's points, with all of their errors; count the samples."""
+    found, counts = lumitexels.collect(
         "normals",
-        lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
+        lambda part, samples: (
+            estimates.normals_from_shading(samples, surface.normals[part]),
+            estimates.count_samples(samples),
+        ),
     )
-    return surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
+    return surface_errors.add_normal_errors(found, surface, dome.pixel_mm), counts
 
 
 def _albedo(
@@ -331,11 +330,11 @@ def measure_albedo(
     """Estimate R_d at a surface's points, with all of its errors."""
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
-    found = lumitexels.collect(
+    (found,) = lumitexels.collect(
         "albedo",
-        lambda part, samples: estimates.estimate_albedo(
-            samples, point_normals[part], stderr_rad=typical
-        ),
+        lambda part, samples: [
+            estimates.estimate_albedo(samples, point_normals[part], stderr_rad=typical)
+        ],
     )
     found = surface_errors.add_albedo_errors(found, point_normals, surface, dome.pixel_mm)
     return surface_errors.add_interior_errors(found)

@@ -286,7 +286,7 @@ def estimate_patch(
     dome = _calibrated_dome(rig, PatchImages(rig, normal, reflection, rng))
     surface = _plane_scan(normal, scan_normal, POINT_SPACING_PX * dome.pixel_mm)
     samples = dome_stages.sample_surface(dome, surface, None)
-    normals = dome_stages.measure_normals(dome, surface, samples)
+    normals, _ = dome_stages.measure_normals(dome, surface, samples)
     r_d = dome_stages.measure_albedo(dome, surface, samples, normals)
     valid = normals.valid & r_d.valid
     error = {NORMAL_QUANTITY: metrics.angular_error_rad(normals.values[valid], normal)}

@@ -353,10 +353,7 @@ def test_points_need_ten_lights_and_two_views(lights, views, enough):
     if not enough:
         assert not estimates.normals_from_shading(samples, up).valid.any()
         assert not estimates.normals_from_half_vectors(samples).valid.any()
-    assert (
-        estimates.count_samples(slice(0, 3), samples).values[:, 0].tolist()
-        == [float(lights * views)] * 3
-    )
+    assert estimates.count_samples(samples).values[:, 0].tolist() == [float(lights * views)] * 3
 
 
 def emptied(samples):
