@@ -1,4 +1,8 @@
-"""Evaluate maps on a mesh against ground truth on another mesh, at nearest points."""
+"""Evaluate maps on a mesh against ground truth on another mesh, at the same points.
+
+The truth is interpolated between its texels: relief turns normals by a good part of their error
+from one texel to the next.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,11 +13,14 @@ from numpy.typing import NDArray
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.contents import intersect_valid
-from skinrig.arrays import BoolArray, Float64Array
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.evaluating import skin_bands
 
 MAX_MATCH_DISTANCE_MM = 3.0
 """Maximum distance of an evaluated point from the true surface, mm."""
+MAX_TEXEL_STRETCH = 5.0
+"""Maximum distance of neighboring texels of the truth over their median distance; farther ones are
+of different charts."""
 CHANNEL_NAMES = ("red", "green", "blue")
 NORMAL_MAPS = ("half_vector_normals", "normals", "normals_refined")
 
@@ -41,22 +48,31 @@ class SurfaceTruthError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class TexelMatch:
-    """Nearest texel of the ground truth for each texel of an estimate.
+    """Place in the ground truth's texture of each texel of an estimate.
 
     Attributes
     ----------
     rows, columns
         Texels of the estimate, shape (N,).
-    truth
-        Flat index into the truth's texels, shape (N,).
+    corners
+        Flat indices of four texels of the truth, the nearest one first, shape (N, 4).
+    weights
+        Their weights, shape (N, 4), of sum 1; that of the nearest is 1 where the others are not
+        all usable.
     distance_mm
-        Distance between the two, mm, shape (N,).
+        Distance to the nearest one, mm, shape (N,).
     """
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
-    truth: NDArray[np.intp]
+    corners: NDArray[np.intp]
+    weights: Float64Array
     distance_mm: Float64Array
+
+    def interpolate(self, truth: SkinMap) -> Float64Array:
+        """Return the values of a map of the truth at the estimate's texels, shape (N, ...)."""
+        flat = truth.values.reshape(-1, *truth.values.shape[2:])
+        return np.asarray(np.einsum("nk,nk...->n...", self.weights, flat[self.corners]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +123,7 @@ def match_texels(
     *,
     max_distance_mm: float = MAX_MATCH_DISTANCE_MM,
 ) -> TexelMatch:
-    """Find the true texel nearest to each texel of an estimate.
+    """Find the place of each texel of an estimate between the texels of the truth.
 
     Parameters
     ----------
@@ -145,7 +161,42 @@ def match_texels(
             f"position: no texel lies within {max_distance_mm:g} mm of the true surface; nearest "
             f"{distance.min() if len(distance) else math.nan:.1f} mm; register the scan"
         )
-    return TexelMatch(rows[near], columns[near], known[index[near]], distance[near])
+    corners, weights = _interpolation(
+        true_place.values.astype(np.float64), usable, known[index[near]], place[near]
+    )
+    return TexelMatch(rows[near], columns[near], corners, weights, distance[near])
+
+
+def _interpolation(
+    true_mm: Float64Array, usable: BoolArray, nearest: NDArray[np.intp], place_mm: Float32Array
+) -> tuple[NDArray[np.intp], Float64Array]:
+    """Return four texels around each place, (N, 4), and their bilinear weights.
+
+    The nearest texel alone counts where the others are not usable, or far from it: at the border of
+    a chart the next texel can be elsewhere on the surface.
+    """
+    height, width = usable.shape
+    row, column = np.divmod(nearest, width)
+    away = place_mm - true_mm[row, column]
+    ways, inside = [], np.ones(len(nearest), np.bool_)
+    for i, j, here, size in ((1, 0, row, height), (0, 1, column, width)):
+        there = (here > 0) & (here < size - 1)
+        inside &= there
+        ahead = true_mm[row + i * there, column + j * there]
+        ways.append(0.5 * (ahead - true_mm[row - i * there, column - j * there]))
+    slopes = np.stack(ways, axis=1)
+    gram = np.einsum("nak,nbk->nab", slopes, slopes) + 1e-9 * np.eye(2)
+    along = np.linalg.solve(gram, np.einsum("nak,nk->na", slopes, away)[..., None])[..., 0]
+    a, b = np.clip(np.abs(along), 0.0, 1.0).T
+    steps = np.where(along < 0.0, -1, 1).T * inside
+    rows = np.stack([row, row + steps[0], row, row + steps[0]], axis=1)
+    columns = np.stack([column, column, column + steps[1], column + steps[1]], axis=1)
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
+    apart = np.linalg.norm(true_mm[rows, columns] - true_mm[row, column][:, None], axis=-1)
+    together = (apart < MAX_TEXEL_STRETCH * np.median(apart[:, 1:3])).all(axis=1)
+    good = inside & usable[rows, columns].all(axis=1) & together
+    alone = np.array([1.0, 0.0, 0.0, 0.0])
+    return rows * width + columns, np.where(good[:, None], weights, alone)
 
 
 def compare(
@@ -185,7 +236,7 @@ def matched_errors(
     values = estimate.values[pairs.rows, pairs.columns].astype(np.float64)
     good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     true_name = "normals" if name in NORMAL_MAPS else name
-    true_values = _flat(truth.maps[true_name])[pairs.truth]
+    true_values = pairs.interpolate(truth.maps[true_name])
     if name in NORMAL_MAPS:
         error = np.degrees(metrics.angular_error_rad(values, true_values))
     else:
@@ -206,7 +257,7 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
     if "r_d" not in truth.maps:
         return []
     pairs = match_texels(appearance, truth)
-    true_color = truth.maps["r_d"].values.reshape(-1, 3)[pairs.truth].astype(np.float64)
+    true_color = pairs.interpolate(truth.maps["r_d"])
     bands = skin_bands.classify_typology(skin_bands.typology_angle_deg(true_color))
     rows: list[Banded] = []
     for key in ("r_d", *NORMAL_MAPS):
@@ -231,7 +282,7 @@ def _angles(
 ) -> SurfaceAccuracy:
     good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     normals = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
-    angle = metrics.angular_error_rad(normals, _flat(truth.maps["normals"])[pairs.truth][good])
+    angle = metrics.angular_error_rad(normals, pairs.interpolate(truth.maps["normals"])[good])
     stderr = None
     if estimate.stderr is not None:
         stderr = estimate.stderr[pairs.rows, pairs.columns][good][:, 0].astype(np.float64)
@@ -249,7 +300,7 @@ def _channels(
 ) -> list[SurfaceAccuracy]:
     good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     values = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
-    true_values = _flat(truth.maps[name])[pairs.truth][good]
+    true_values = pairs.interpolate(truth.maps[name])[good]
     rows = []
     for channel, color in enumerate(CHANNEL_NAMES):
         value, true_value = values[:, channel], true_values[:, channel]
@@ -292,8 +343,3 @@ def _row(
         coverage=coverage,
         median_stderr=stderr,
     )
-
-
-def _flat(skin_map: SkinMap) -> Float64Array:
-    values = skin_map.values
-    return values.reshape(-1, *values.shape[2:]).astype(np.float64)

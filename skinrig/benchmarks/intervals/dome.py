@@ -75,10 +75,7 @@ def face_trials(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iter
         Preset and seed.
     """
     pairs = surface_evaluation.match_texels(found, truth)
-    true_normals, true_albedo = (
-        truth.maps[key].values.reshape(-1, 3).astype(np.float64)[pairs.truth]
-        for key in ("normals", "r_d")
-    )
+    true_normals, true_albedo = (pairs.interpolate(truth.maps[key]) for key in ("normals", "r_d"))
     band = str(skin_bands.classify_typology(np.median(skin_bands.typology_angle_deg(true_albedo))))
     subject = TrialSubject(name, band)
     for name, quantity in NORMAL_MAP_NAMES.items():

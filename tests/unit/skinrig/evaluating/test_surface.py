@@ -84,3 +84,45 @@ def test_a_scan_that_is_not_registered_is_named(rng):
     truth, maps = plane(10, rng), plane(10, rng, shift_mm=80.0)
     with pytest.raises(evaluation.SurfaceTruthError, match="register the scan"):
         evaluation.match_texels(appearance(maps), appearance(truth))
+
+
+def ripples(maps):
+    """Normals of waves of 6 mm, tilted by up to 3 degrees."""
+    x, y = maps["position"][..., 0], maps["position"][..., 1]
+    slopes = 0.05 * np.sin(x * 2 * np.pi / 6), 0.05 * np.cos(y * 2 * np.pi / 6)
+    return np.stack([*slopes, np.ones_like(x)], axis=-1)
+
+
+def test_truth_between_texels_is_interpolated(rng):
+    truth, maps = plane(41, rng), plane(97, rng)
+    truth["normals"], maps["normals"] = ripples(truth), ripples(maps)
+    found, true = appearance(maps), appearance(truth)
+    pairs = evaluation.match_texels(found, true)
+    between = pairs.weights[:, 0] < 1.0  # not so at the border of the square
+    own = maps["normals"][pairs.rows, pairs.columns]
+    errors = np.abs(pairs.interpolate(true.maps["normals"]) - own)[between]
+    # linear interpolation over h errs by at most h^2 / 8 of the second derivative
+    assert errors.max() < 0.05 * (0.5 * math.tau / 6.0) ** 2 / 8.0 + 1e-6
+    nearest = true.maps["normals"].values.reshape(-1, 3)[pairs.corners[:, 0]]
+    assert np.abs(nearest - own)[between].max() > 5.0 * errors.max()
+    assert between.mean() > 0.9
+
+
+@pytest.mark.parametrize("broken", ["masked", "elsewhere"])
+def test_nearest_texel_counts_alone_at_a_border(rng, broken):
+    truth, maps = plane(41, rng), plane(97, rng)
+    valid = np.ones((41, 41), bool)
+    if broken == "masked":
+        valid[:, 20:] = False
+    else:  # another chart begins here, 100 mm away
+        truth["position"][:, 20:, 2] = 100.0
+    units = {"position": "mm"}
+    true = SkinAppearance(
+        {name: SkinMap(each, units.get(name, "1"), valid=valid) for name, each in truth.items()},
+        "simulated",
+    )
+    pairs = evaluation.match_texels(appearance(maps), true)
+    used = np.where(pairs.weights > 0.0, pairs.corners % 41, 0)
+    assert used.max() == 19
+    np.testing.assert_allclose(pairs.weights.sum(axis=1), 1.0, rtol=1e-12)
+    assert pairs.interpolate(true.maps["position"])[:, 2].max() == 0.0
