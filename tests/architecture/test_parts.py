@@ -40,7 +40,8 @@ def test_unrecorded_long_file_precedes_quick_files(conftest):
     def item(path, marker):
         return SimpleNamespace(path=Path(path), get_closest_marker=lambda name: marker)
 
-    seconds = conftest.expect_durations_s([item("test_new.py", "long"), item("test_quick.py", None)])
+    items = [item("test_new.py", "long"), item("test_quick.py", None)]
+    seconds = conftest.expect_durations_s(items)
     assert seconds[Path("test_new.py")] == conftest.UNRECORDED_LONG_S
     assert Path("test_quick.py") not in seconds
     assert seconds.items() >= conftest.recorded_durations_s().items()
