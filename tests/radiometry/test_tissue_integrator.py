@@ -199,7 +199,7 @@ SCENES = {
     "uneven": ({"eta": 1.0, "uneven": True}, {"eta": 1.0, "uneven": False}, 512),
     "relief": ({"height": 0.1}, {"height": 0.1, "absorption": 1.5}, 1024),
 }
-"""Scene, the same with one thing wrong, and samples: uneven voxels alone, and below a rough relief."""
+"""Scene, the same with one thing wrong, and samples; the relief has a rough boundary."""
 
 
 @pytest.mark.long
