@@ -64,6 +64,8 @@ MIN_RECORDED_S = 2.0
 DURATIONS = ROOT / "tests" / "durations.csv"
 """Seconds of each test file, recorded by `pytest --record-durations`. One process runs a file from
 end to end, so a long file taken up last would leave the others without work."""
+UNRECORDED_LONG_S = 20.0
+"""Assumed seconds of a file with long tests that is not in `DURATIONS`: it is not taken up last."""
 
 
 def pytest_addoption(parser):
@@ -137,9 +139,15 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def recorded_durations_s():
-    """Seconds by file; a file that no run has recorded yet counts as quick."""
+    """Return the seconds by file of `DURATIONS`."""
     with DURATIONS.open(newline="", encoding="utf-8") as file:
         return {ROOT / row["file"]: float(row["seconds"]) for row in csv.DictReader(file)}
+
+
+def expect_durations_s(items):
+    """Return the recorded seconds by file; of others, the assumed ones where a test is long."""
+    long = {item.path for item in items if item.get_closest_marker("long")}
+    return dict.fromkeys(long, UNRECORDED_LONG_S) | recorded_durations_s()
 
 
 def pytest_collection():
@@ -177,7 +185,7 @@ def choose_files(part, tests, seconds):
 
 @pytest.hookimpl(trylast=True)  # what is not asked for has been left out
 def pytest_collection_modifyitems(config, items):
-    seconds = recorded_durations_s()
+    seconds = expect_durations_s(items)
     tests = Counter(item.path for item in items)
     part = choose_files(config.getoption("part"), tests, seconds)
     config.hook.pytest_deselected(items=[item for item in items if item.path not in part])

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Make .venv with everything that `make demo` and `make test` need, and say what is done.
 # With the word `demo`, make what the demo's first rig needs and no more: it starts sooner.
-# Runs again only when pyproject.toml or constraints.txt changed.
+# Runs again only when pyproject.toml or constraints.txt changed. SKINRIG_EXTRAS=dev,docs installs other extras
+# than dev; SKINRIG_NO_KERNELS=1 compiles nothing ahead.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 scope=${1:-all}
@@ -67,7 +68,7 @@ if [ ! -x .venv/bin/python ]; then
 fi
 case $scope in
   demo) extras='' compile_for=(--rig flash) ;;
-  *) extras='[dev]' compile_for=() ;;
+  *) extras="[${SKINRIG_EXTRAS:-dev}]" compile_for=() ;;
 esac
 say "installing skinrig and its pinned dependencies into .venv (about a minute)"
 # a build environment made from the same pinned list, so that nothing unpinned runs; Python compiles
@@ -78,9 +79,11 @@ pip_install() {
 }
 pip_install setuptools wheel
 pip_install --no-build-isolation -e ".$extras"
-say "compiling kernels that the demo calls (one to three minutes on two cores; else the first call does it)"
-.venv/bin/python tools/compile_kernels.py ${compile_for[@]+"${compile_for[@]}"} ||
-  say "the kernels could not be compiled ahead: each is compiled when it is first called"
+if [ "${SKINRIG_NO_KERNELS:-}" = "" ]; then
+  say "compiling kernels that the demo calls (one to three minutes on two cores; else the first call does it)"
+  .venv/bin/python tools/compile_kernels.py ${compile_for[@]+"${compile_for[@]}"} ||
+    say "the kernels could not be compiled ahead: each is compiled when it is first called"
+fi
 touch .venv/.demo
 [ "$scope" = demo ] || touch .venv/.ready
 say "done: .venv/bin/skinrig is installed"

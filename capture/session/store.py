@@ -192,7 +192,8 @@ class Session(SessionView):
                 if contents.walk.torn:
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
-                    disk.fdatasync(descriptor)
+                # the last process may have ended before the disk confirmed its last line
+                disk.fdatasync(descriptor)
                 move_orphans(disk, place, contents)
             except BaseException:
                 disk.close(descriptor)

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,8 +12,13 @@ SECONDS = {path: 2.0 * rank for rank, path in enumerate(sorted(TESTS))}
 
 
 @pytest.fixture
-def choose(request):
-    return request.config.pluginmanager.get_plugin(str(CONFTEST)).choose_files
+def conftest(request):
+    return request.config.pluginmanager.get_plugin(str(CONFTEST))
+
+
+@pytest.fixture
+def choose(conftest):
+    return conftest.choose_files
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 25])
@@ -28,3 +34,14 @@ def test_each_file_is_in_one_part(count, choose):
 def test_part_without_meaning_is_refused(part, choose):
     with pytest.raises(pytest.UsageError, match=f"got '{part}', expected such as 2/3"):
         choose(part, TESTS, SECONDS)
+
+
+def test_unrecorded_long_file_precedes_quick_files(conftest):
+    def item(path, marker):
+        return SimpleNamespace(path=Path(path), get_closest_marker=lambda name: marker)
+
+    items = [item("test_new.py", "long"), item("test_quick.py", None)]
+    seconds = conftest.expect_durations_s(items)
+    assert seconds[Path("test_new.py")] == conftest.UNRECORDED_LONG_S
+    assert Path("test_quick.py") not in seconds
+    assert seconds.items() >= conftest.recorded_durations_s().items()

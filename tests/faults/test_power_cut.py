@@ -215,6 +215,29 @@ def test_second_power_cut_while_resuming_keeps_acknowledged_data(tmp_path):
     assert set(counts) == {"ok"}
 
 
+def test_resuming_confirms_line_of_interrupted_process(tmp_path):
+    """A process ended between its last line and that line's synchronization; another continues."""
+    plan, root = plan_of(2), tmp_path / "real"
+    root.mkdir()
+    disk = LoggedDisk(root)
+    session = create(root / "s", plan, disk)
+    disk.note("acknowledged", "created")
+    disk.left_out = "journal.jsonl"
+    commit(session, "S000")
+    session.release()
+    disk.left_out = LoggedDisk.left_out
+    with Session.resume(root / "s", disk=disk) as resumed:
+        commit(resumed, "S001")
+        disk.note("acknowledged", "S001")
+    counts = Counter()
+    for number, (image, acknowledged) in enumerate(crash_images(disk.log)):
+        place = tmp_path / f"{number}"
+        place.mkdir()
+        lay_out(image, place)
+        counts[judge(place / "s", acknowledged, plan)] += 1
+    assert set(counts) == {"ok"}
+
+
 class Inheriting(LoggedDisk):
     """A logged disk that begins with an image, all of it on the medium."""
 

@@ -40,7 +40,7 @@ def test_controller_obeys_rules_on_noisy_line(box):
 @pytest.mark.parametrize("box", HOSTS)
 def test_controller_obeys_rules_on_noisy_line_long_run(box):
     _, host, steps = HOSTS[box]
-    explore(host, 120, steps=steps)
+    explore(host, 60, steps=steps)
 
 
 @pytest.mark.long

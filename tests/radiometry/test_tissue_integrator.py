@@ -196,11 +196,10 @@ def agree(ours, peer):
 
 
 SCENES = {
-    "matched": ({"eta": 1.0}, {"eta": 1.0, "absorption": 1.3}, 512),
     "uneven": ({"eta": 1.0, "uneven": True}, {"eta": 1.0, "uneven": False}, 512),
-    "rough": ({}, {"eta": 1.2}, 1024),
     "relief": ({"height": 0.1}, {"height": 0.1, "absorption": 1.5}, 1024),
 }
+"""Scene, the same with one thing wrong, and samples; the relief has a rough boundary."""
 
 
 @pytest.mark.long

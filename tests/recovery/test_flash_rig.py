@@ -22,7 +22,7 @@ from skinrig.simulating.simulation import simulate_session
 
 pytestmark = pytest.mark.render
 
-WIDTH_PX = 768  # the demo's
+WIDTH_PX = 512
 TODAY = date.today()
 PLAIN = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
 NARROW = {"subject": "II", "seed": 114, "leave_out": PLAIN}
