@@ -221,10 +221,7 @@ def _find_in_images(
         Images for the normals, and images that may have moved.
     """
     mask = stack.inside
-    maps = estimate_normals(stack.gray[used], rows[used], valid=stack.usable[used] & mask)
-    valid = maps.valid & mask
-    normals = np.where(valid[..., None], maps.normals, 0.0).astype(np.float64)
-    albedo = np.where(valid, maps.albedo, 0.0).astype(np.float64)
+    valid, normals, albedo = _fit_surface(stack, rows, used)
     shading = np.maximum(np.einsum("hwi,ni->nhw", normals, rows), 0.0)
     findings = list(axis_faults.find_axes(normals, valid))
     if not findings:  # wrong axes change shading along rows
@@ -233,8 +230,16 @@ def _find_in_images(
             stack.gray[used], stack.usable[used], valid, predicted
         )
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
-    scaled = albedo[..., None] * normals
-    moved = find_moved(stack.gray[kept], stack.usable[kept], valid, scaled, step=stack.step)
+
+    def fit_without(number: int) -> Float64Array:
+        others = used[used != kept[number]]
+        _, other_normals, other_albedo = _fit_surface(stack, rows, others)
+        return other_albedo[..., None] * other_normals
+
+    moved = find_moved(
+        stack.gray[kept], stack.usable[kept], valid, albedo[..., None] * normals,
+        fit_without=fit_without, step=stack.step,
+    )  # fmt: skip
     findings += [_renumbered(one, kept) for one in moved]
     height, width = mask.shape
     places = np.argwhere(valid)
@@ -249,6 +254,17 @@ def _find_in_images(
     weights = lit.astype(np.float64)
     findings += light_faults.find_near(over_albedo, weights, mirror_cosine, rows[used], xy)
     return findings
+
+
+def _fit_surface(
+    stack: ReducedStack, rows: Float64Array, used: NDArray[np.intp]
+) -> tuple[BoolArray, Float64Array, Float64Array]:
+    """Return valid pixels (H, W), normals (H, W, 3) and albedo (H, W) of some of the images."""
+    usable = stack.usable[used] & stack.inside
+    maps = estimate_normals(stack.gray[used], rows[used], valid=usable)
+    valid = maps.valid & stack.inside
+    normals = np.where(valid[..., None], maps.normals, 0.0).astype(np.float64)
+    return valid, normals, np.where(valid, maps.albedo, 0.0).astype(np.float64)
 
 
 def _renumbered(one: Finding, numbers: NDArray[np.intp]) -> Finding:

@@ -17,6 +17,8 @@ MIN_CURVE_MISFIT = 0.02
 """Misfit to equal lights from which another curve is considered."""
 CURVE_RATIO = 0.6
 """Ratio of misfits below which another curve is reported."""
+MAX_CURVE_MISFIT = 0.05
+"""Misfit under another curve, above which that curve does not explain the images either."""
 MAX_AMBIENT = 0.03
 """Light in attached shadows over the albedo."""
 SHADOW_COSINE = -0.15
@@ -84,7 +86,7 @@ def find_curve(
         for name, decode in CURVES_BY_NAME.items()
     }
     best = min(found, key=lambda name: found[name])
-    if found[best] < CURVE_RATIO * listed:
+    if found[best] < min(CURVE_RATIO * listed, MAX_CURVE_MISFIT):
         yield Finding(
             "transfer curve", (),
             f"equal lights fit to {found[best]:.1%} if these are {best}, else to {listed:.1%}",
