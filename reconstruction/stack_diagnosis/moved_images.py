@@ -156,12 +156,32 @@ def _relight(
     image: Float64Array, good: BoolArray, scaled_normals: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
     """Return the shading under the light that fits an image, and where it may have highlights."""
-    lit = good & (image > MIN_SHADING * np.quantile(image[good], 0.95))
-    if np.count_nonzero(lit) < MIN_SAMPLES:
+    light = fit_light(image, good, scaled_normals)
+    if not light.any():
         return np.zeros(image.shape), np.zeros(image.shape, bool)
+    towards = light / max(float(np.linalg.norm(light)), 1e-12) + np.array([0.0, 0.0, 1.0])
+    length = max(float(np.linalg.norm(towards)), 1e-12)
+    albedo = np.linalg.norm(scaled_normals, axis=-1)
+    mirrors = scaled_normals @ towards > MAX_MIRROR_COSINE * albedo * length
+    return np.asarray(np.maximum(scaled_normals @ light, 0.0)), np.asarray(mirrors)
+
+
+def fit_light(image: Float64Array, good: BoolArray, scaled_normals: Float64Array) -> Float64Array:
+    """Return the light, (3,), that fits an image by Tukey's biweight; 0 for too few lit samples.
+
+    Parameters
+    ----------
+    image, good
+        (H, W), and which of its samples are usable.
+    scaled_normals
+        (H, W, 3), normals times albedo.
+    """
+    lit = good & (image > MIN_SHADING * np.quantile(image[good], 0.95)) if good.any() else good
+    light: Float64Array = np.zeros(3)
+    if np.count_nonzero(lit) < MIN_SAMPLES:
+        return light
     values, rows = image[lit], scaled_normals[lit]
     weights: Float64Array = np.ones(len(values))
-    light: Float64Array = np.zeros(3)
     for _ in range(N_FIT_STEPS):
         scaled = rows * weights[:, None]
         normal = rows.T @ scaled + 1e-9 * np.eye(3)
@@ -169,11 +189,7 @@ def _relight(
         residual = values - rows @ light
         spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
         weights = np.maximum(1.0 - (residual / (TUKEY_CONSTANT * spread)) ** 2, 0.0) ** 2
-    towards = light / max(float(np.linalg.norm(light)), 1e-12) + np.array([0.0, 0.0, 1.0])
-    length = max(float(np.linalg.norm(towards)), 1e-12)
-    albedo = np.linalg.norm(scaled_normals, axis=-1)
-    mirrors = scaled_normals @ towards > MAX_MIRROR_COSINE * albedo * length
-    return np.asarray(np.maximum(scaled_normals @ light, 0.0)), np.asarray(mirrors)
+    return light
 
 
 def _fine(values: Float64Array, weights: Float64Array) -> Float64Array:
