@@ -44,9 +44,10 @@ from reconstruction.stack_diagnosis.pattern_faults import PATTERN_NAMES, find_pa
 from reconstruction.stack_diagnosis.polarized_pairs import find_pair_faults
 
 TABLE = Path(__file__).with_name("pain_suite.csv")
-FIRST_SEED = 110_000
-"""Rules were set on seeds 300 to 312, 20146 to 20151, 30000 to 30023, 50000 to 50503 and 55000 to
-55329; seeds 20000 to 60503, 80000 to 80999 and 90000 to 90999 were judged before."""
+FIRST_SEED = 150_000
+"""Rules were set on seeds 300 to 312, 20146 to 20151, 30000 to 30023, 50000 to 50503, 55000 to
+55329, 110000 to 110732 and 120000 to 123071; seeds 20000 to 60503, 80000 to 80999, 90000 to 90999,
+110000 to 113193, 130000 to 133193 and 140000 to 140773 were judged before."""
 KEYS = ("images", "fault", "severity", "rig", "tone", "seed", "side")
 NAMES = {"lights": GRADED, "pair": PAIR_FAULTS, "patterns": PATTERN_FAULTS}
 """What the diagnosis calls each fault, by kind of images."""

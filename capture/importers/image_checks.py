@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.documents import Fault, InputError
+from capture.importers.exif import ExifData, read_exif
 
 MAX_IMAGE_BYTES = 2**30
 MAX_IMAGE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
@@ -86,9 +87,9 @@ def check_size(width: int, height: int, where: str) -> None:
         )
 
 
-def check_png(data: bytes, where: str) -> tuple[list[str], int]:
-    """Check the chunks of a PNG, and return notes on its content and its EXIF orientation."""
-    at, orientation = 8, 1
+def check_png(data: bytes, where: str) -> tuple[list[str], ExifData]:
+    """Check the chunks of a PNG, and return notes on its content and its EXIF data."""
+    at, exif = 8, ExifData()
     kinds: set[bytes] = set()
     notes: list[str] = []
     while True:
@@ -111,25 +112,23 @@ def check_png(data: bytes, where: str) -> tuple[list[str], int]:
             if color in (4, 6):
                 notes.append("transparency was dropped")
         if kind == b"eXIf":
-            found_notes, orientation = _check_exif(data[at + 8 : at + 8 + length])
-            notes += found_notes
+            exif = read_exif(data[at + 8 : at + 8 + length])
+            notes += _note_exif(exif)
         kinds.add(kind)
         at += 12 + length
         if kind == b"IEND":
             break
     if kinds & {b"iCCP", b"cICP"}:
         notes.append("its color profile was not applied; the colors count as sRGB")
-    return notes, orientation
+    return notes, exif
 
 
-_EXIF_POINTER, _COLOR_SPACE_TAG, _UNCALIBRATED = 0x8769, 0xA001, 0xFFFF
-ORIENTATION_TAG, N_ORIENTATIONS = 0x0112, 8
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
-def check_jpeg(data: bytes, where: str) -> tuple[list[str], int]:
-    """Check the segments of a JPEG, and return notes on its content and its EXIF orientation."""
-    at, notes, sized, orientation = 2, [], False, 1
+def check_jpeg(data: bytes, where: str) -> tuple[list[str], ExifData]:
+    """Check the segments of a JPEG, and return notes on its content and its EXIF data."""
+    at, notes, sized, exif = 2, [], False, ExifData()
     cut = image_error("is cut short", where, "JPEG", f"{len(data)} bytes", "a whole file")
     while True:
         if at + 4 > len(data):
@@ -156,24 +155,23 @@ def check_jpeg(data: bytes, where: str) -> tuple[list[str], int]:
         if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0") and b"sRGB" not in body:
             notes.append("its color profile was not applied; the colors count as sRGB")
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
-            found, orientation = _check_exif(body[6:])
-            notes += found
+            exif = read_exif(body[6:])
+            notes += _note_exif(exif)
         at += 2 + length
         if marker == 0xDA:
             break
     # the scan escapes 0xFF, so that this can only be the end of the image
     if not sized or data.find(b"\xff\xd9", at) < 0:
         raise cut
-    return list(dict.fromkeys(notes)), orientation
+    return list(dict.fromkeys(notes)), exif
 
 
-def _check_exif(tiff: bytes) -> tuple[list[str], int]:
-    """Return notes on EXIF data of a file that is decoded upright, and its orientation."""
-    uncalibrated, orientation = _read_exif(tiff)
-    notes = note_orientation(orientation)
-    if uncalibrated:
-        notes = ["its EXIF names no sRGB (uncalibrated color); the colors count as sRGB", *notes]
-    return notes, orientation
+def _note_exif(exif: ExifData) -> list[str]:
+    """Return notes on EXIF data of a file that is decoded upright."""
+    notes = note_orientation(exif.orientation)
+    if exif.uncalibrated:
+        return ["its EXIF names no sRGB (uncalibrated color); the colors count as sRGB", *notes]
+    return notes
 
 
 def note_orientation(orientation: int) -> list[str]:
@@ -198,28 +196,6 @@ def turn_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     if orientation in (2, 3, 6, 7):
         pixels = pixels[:, ::-1]
     return pixels
-
-
-def _read_exif(tiff: bytes) -> tuple[bool, int]:
-    """Return whether EXIF data state a color space that is not sRGB, and the orientation.
-
-    Exif 2.32, tags 0xA001 and 0x0112.
-    """
-    from PIL.Image import Exif
-
-    found = Exif()
-    try:
-        found.load(b"Exif\0\0" + tiff)
-        orientation = found.get(ORIENTATION_TAG, 1)
-        uncalibrated = found.get_ifd(_EXIF_POINTER).get(_COLOR_SPACE_TAG) == _UNCALIBRATED
-    except (SyntaxError, ValueError, struct.error, OSError):  # damaged: the pixels may be right
-        return False, 1
-    return uncalibrated, known_orientation(orientation)
-
-
-def known_orientation(value: object) -> int:
-    """Return an orientation from 1 to 8; 1 for any other value."""
-    return value if isinstance(value, int) and 1 <= value <= N_ORIENTATIONS else 1
 
 
 def require_photograph(file: Path, head: bytes) -> None:

@@ -165,8 +165,8 @@ def import_light_list(
         if where_mask is not None:
             session.attach("mask.png", _mask_png(where_mask, first.frame))
         for step, file in zip(steps, found.images, strict=True):
-            frame = read_photo(file, white_value=first.white_value).frame
-            _commit(session, step, frame, clock, as_linear=as_linear)
+            photo = read_photo(file, white_value=first.white_value)
+            _commit(session, step, photo, clock, as_linear=as_linear)
     listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
     return ImageStackImport(str(target), len(steps), listed, shown, masked, every)
 
@@ -311,22 +311,14 @@ def _mask_png(path: Path, frame: raw.RawFrame) -> bytes:
 
 
 def _commit(
-    session: Session,
-    step: Step,
-    frame: raw.RawFrame,
-    clock: Callable[[], datetime],
-    *,
-    as_linear: bool,
+    session: Session, step: Step, photo: Photo, clock: Callable[[], datetime], *, as_linear: bool
 ) -> None:
+    frame = photo.frame
     if as_linear:
         share = np.arange(frame.white + 1) / frame.white
         undone = np.rint(frame.white * encode_srgb(share)).astype(np.uint16)
         frame = replace(frame, cfa=undone[np.minimum(frame.cfa, frame.white)])
-    settings: dict[str, Value] = dict(step.settings)
-    if frame.exposure_s is not None:
-        settings["exposure_s"] = frame.exposure_s
-    if frame.iso is not None:
-        settings["iso"] = frame.iso
+    settings: dict[str, Value] = {**step.settings, **photo.exposure_settings}
     frame = replace(frame, camera_serial="unknown", step_id=step.id, session_id=session.id)
     blob, now_s = raw.encode_frame(frame), clock().timestamp()
     session.commit(step.id, "cam", blob, settings=settings, actual={}, t_host_s=now_s)

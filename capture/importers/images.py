@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from capture import raw
 from capture.arrays import FloatArray, UInt16Array
 from capture.documents import InputError
+from capture.importers.exif import EXIF_POINTER_TAG, ORIENTATION_TAG, ExifData, read_tiff_exif
 from capture.importers.image_checks import (
-    ORIENTATION_TAG,
     check_jpeg,
     check_png,
     check_size,
     image_error,
-    known_orientation,
     note_orientation,
     photo_error,
     read_head,
@@ -65,6 +64,18 @@ class Photo:
     contains integers."""
     orientation: int = 1
     """EXIF orientation, 1 to 8, by which the pixels were turned upright."""
+    flash_fired: bool | None = None
+    """Whether EXIF data state that a flash fired; None: they do not state it."""
+
+    @property
+    def exposure_settings(self) -> dict[str, str | int | float]:
+        """Stated settings of the exposure, by the names that `compute_exposure` reads."""
+        frame = self.frame
+        stated = {"exposure_s": frame.exposure_s, "iso": frame.iso, "f_number": frame.f_number}
+        settings: dict[str, str | int | float] = {k: v for k, v in stated.items() if v is not None}
+        if self.flash_fired is not None:
+            settings["flash"] = "fired" if self.flash_fired else "off"
+        return settings
 
 
 def read_photo(
@@ -97,11 +108,11 @@ def read_photo(
     where = str(file)
     head = read_head(file, where)
     if head.startswith(_JPEG_MAGIC):
-        notes, orientation = check_jpeg(file.read_bytes(), where)
-        return replace(_display(file, where, "JPEG", notes), orientation=orientation)
+        notes, exif = check_jpeg(file.read_bytes(), where)
+        return _state_exposure(_display(file, where, "JPEG", notes), exif)
     if head.startswith(_PNG_MAGIC):
-        notes, orientation = check_png(file.read_bytes(), where)
-        return replace(_display(file, where, "PNG", notes), orientation=orientation)
+        notes, exif = check_png(file.read_bytes(), where)
+        return _state_exposure(_display(file, where, "PNG", notes), exif)
     if head.startswith(_EXR_MAGIC):
         return _exr(file, where, white_value)
     if head.startswith(_TIFF_MAGICS) and file.suffix.lower() in _TIFF_SUFFIXES:
@@ -206,6 +217,16 @@ def _frame(values: UInt16Array, black: int) -> raw.RawFrame:
     )
 
 
+def _state_exposure(photo: Photo, exif: ExifData) -> Photo:
+    """Return a developed image with the exposure and orientation that its EXIF data state."""
+    frame = replace(
+        photo.frame, exposure_s=exif.exposure_s, iso=exif.iso, f_number=exif.f_number
+    )  # fmt: skip
+    return replace(
+        photo, frame=frame, orientation=exif.orientation, flash_fired=exif.flash_fired
+    )  # fmt: skip
+
+
 def _display(file: Path, where: str, what: str, notes: list[str]) -> Photo:
     import cv2
 
@@ -290,7 +311,8 @@ def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
                 raise image_error("is cut short", where, "TIFF", f"{size} bytes", "a whole file")
             planar = int(page.planarconfig) == 2 and page.samplesperpixel > 1
             profile = 34675 in page.tags
-            orientation = known_orientation(page.tags.valueof(ORIENTATION_TAG))
+            tags = page.tags
+            exif = read_tiff_exif(tags.valueof(EXIF_POINTER_TAG), tags.valueof(ORIENTATION_TAG))
             pages = len(stream.pages)
             pixels = np.asarray(page.asarray())
     except InputError:
@@ -317,8 +339,8 @@ def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
         pixels = np.moveaxis(pixels, 0, -1)
     if profile:
         notes.append("its color profile was not applied; the colors count as sRGB primaries")
-    pixels = turn_upright(_channels(pixels, where, notes), orientation)
-    notes += note_orientation(orientation)
+    pixels = turn_upright(_channels(pixels, where, notes), exif.orientation)
+    notes += note_orientation(exif.orientation)
     if pixels.dtype == np.uint8:
         photo = _from_display(pixels, where, notes)
     elif pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
@@ -327,7 +349,7 @@ def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
         raise image_error(
             "has an unknown depth", where, "samples", str(pixels.dtype), "8, 16 bit or float"
         )
-    return replace(photo, orientation=orientation)
+    return _state_exposure(photo, exif)
 
 
 def _exr(file: Path, where: str, white_value: float | None) -> Photo:

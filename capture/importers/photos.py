@@ -24,6 +24,7 @@ from capture.importers.imported_session import (
     make_placeholder_view,
     restate_white,
 )
+from capture.importers.pair_exposures import relate_exposures
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Rig, View
 from capture.session import Session, SubjectRecord
@@ -73,8 +74,8 @@ class _Entry:
     sha256: str
     encoding: Encoding
     view: View
-    exposure_s: float | None
-    iso: int | None
+    exposure: Mapping[str, str | int | float]
+    """Settings of the exposure that the file states, see `Photo.exposure_settings`."""
     notes: tuple[str, ...]
     white_value: float | None
     framing: Framing
@@ -166,9 +167,9 @@ def import_photos(
     entries = _inspect(files, framing, turn_raw=rig is None, repair=repair)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
-    steps = _steps(entries, views, kind)
+    steps, exposures = _relate_pairs(_steps(entries, views, kind))
     own = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
-    assumed = [*assumed, *own, *_list_unequal_partners(steps)]
+    assumed = [*assumed, *own, *_list_unequal_partners(steps), *exposures]
     plan = Plan(used.name, tuple(step for step, _ in steps))
     listed = [
         {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}
@@ -275,8 +276,7 @@ def _entry(file: Path, photo: Photo, framing: Framing, face: tuple[float, ...]) 
         hash_file(file),
         photo.encoding,
         view,
-        frame.exposure_s,
-        frame.iso,
+        photo.exposure_settings,
         photo.notes,
         photo.white_value,
         framing,
@@ -362,12 +362,29 @@ def _steps(
         settings: dict[str, Value] = {}
         if polarizer is not None:
             settings["polarizer"] = polarizer
-        if entry.exposure_s is not None:
-            settings["exposure_s"] = entry.exposure_s
-        if entry.iso is not None:
-            settings["iso"] = entry.iso
+        settings |= entry.exposure
         steps.append((Step(f"P{number:03d}", kind, index, settings, (view,)), entry))
     return steps
+
+
+def _relate_pairs(
+    steps: Sequence[tuple[Step, _Entry]],
+) -> tuple[list[tuple[Step, _Entry]], list[str]]:
+    """Return the steps with the relative exposure of parallel photographs, and what is assumed."""
+    related, texts = list(steps), []
+    for pair in _group_pairs(steps):
+        if not _is_polarized_pair(pair) or len(pair) != 2:
+            continue
+        parallel, crossed = sorted(pair, key=lambda one: _parse_stem(one.file.stem)[1] == "crossed")
+        names = parallel.file.name, crossed.file.name
+        ratio, text = relate_exposures(parallel.exposure, crossed.exposure, names)
+        texts += [text] * bool(text)
+        if ratio != 1.0:
+            at = next(k for k, (_, entry) in enumerate(steps) if entry is parallel)
+            step = steps[at][0]
+            settings = {**step.settings, "relative_exposure": ratio}
+            related[at] = replace(step, settings=settings), parallel
+    return related, texts
 
 
 def _assumptions(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from capture.importers.exif import compute_exposure
 from capture.session import Session
 from capture.session.view import FrameRecord
 from model.checks import Checks
@@ -24,7 +25,7 @@ from reconstruction.pipeline.linear_frame import read_linear
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 7
+STAGE_REVISION = 8
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -92,12 +93,10 @@ def _stack(session: Session) -> LightStack:
     records = tuple(session.frames("olat"))
     got = f"{len(records)} frames under one light at a time"
     Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3; add images")
-    exposures = [
-        float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
-        for r in records
-    ]
+    stated = [compute_exposure(record.settings) for record in records]
+    exposures = [one for one in stated if one is not None]
     gain = np.ones((len(records), 3))
-    if all(e > 0 for e in exposures):
+    if len(exposures) == len(records):
         gain *= (np.median(exposures) / np.array(exposures))[:, None]
     listed = session.manifest.extra.get("light_list")
     strength = listed.get("intensity") if isinstance(listed, dict) else None

@@ -16,7 +16,7 @@ from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.stack_diagnosis import axis_faults, frame_faults, light_faults
 from reconstruction.stack_diagnosis.finding import Finding
 from reconstruction.stack_diagnosis.light_labels import find_order
-from reconstruction.stack_diagnosis.moved_images import find_moved
+from reconstruction.stack_diagnosis.moved_images import find_moved, fit_light
 from reconstruction.stack_diagnosis.reduced_stack import ReducedStack, reduce_stack
 from reconstruction.stack_diagnosis.shading_space import (
     MAX_POINTS,
@@ -26,6 +26,9 @@ from reconstruction.stack_diagnosis.shading_space import (
 
 MIN_FRAMES = 6
 """Fewer images leave no redundancy to find a wrong one."""
+MIN_CERTAIN_FRAMES = 12
+"""Fewer images leave points with four lit samples or fewer, whose shading follows a highlight: then
+the other images must confirm a wrong light."""
 MIN_POINTS = 30
 MIN_LEVEL, MAX_LEVEL = 1e-3, 2.0
 """Bright samples outside this range are in another unit than the white level."""
@@ -163,19 +166,22 @@ def _diagnose_light(
             f"gray: got {samples.shape[1]} bright points, expected {MIN_POINTS}; "
             "check mask and exposure"
         )
-    full = [_renumbered(one, kept) for one in frame_faults.find_full_bright(samples)]
+    full = [one.renumber(kept) for one in frame_faults.find_full_bright(samples)]
     if full:
         out[[number for one in full for number in one.frames]] = True
         found = _diagnose_light(stack, listed, out, rng)
         return replace(found, findings=(*full, *found.findings))
-    findings = [_renumbered(one, kept) for one in frame_faults.find_repeated(samples, listed[kept])]
+    findings = [one.renumber(kept) for one in frame_faults.find_repeated(samples, listed[kept])]
     repeated = {number for one in findings for number in one.frames}
     space = fit_shading_space(samples, clear)
     if space.singular_ratio < MIN_SINGULAR_RATIO:
         return replace(nothing, findings=tuple(findings))
     placed, agreement, wrong = find_order(space, samples, clear, listed[kept], rng)
-    suspects = [_renumbered(one, kept) for one in wrong]
+    suspects = [one.renumber(kept) for one in wrong]
     order[kept] = kept[placed]
+    if len(kept) < MIN_CERTAIN_FRAMES:
+        limit_deg = agreement.limit_deg
+        suspects = _drop_refuted(suspects, stack, listed[order], kept, limit_deg)
     directions[kept] = agreement.directions
     strength[kept] = np.maximum(agreement.strength, MIN_STRENGTH)
     findings += light_faults.find_curve(samples, clear, listed[order[kept]], rng)
@@ -185,9 +191,7 @@ def _diagnose_light(
     swapped = {number for one in suspects if one.fault == SWAPPED for number in one.frames}
     unexplained = {n for one in suspects if one.fault == WRONG for n in one.frames}
     right = np.array([number not in unexplained for number in kept])
-    lights = [
-        _renumbered(one, kept) for one in light_faults.find_strengths(agreement.strength, right)
-    ]
+    lights = [one.renumber(kept) for one in light_faults.find_strengths(agreement.strength, right)]
     out[list(unexplained)] = True
     used = np.flatnonzero(~out)
     view = replace(stack, gray=stack.gray / strength[:, None, None])
@@ -200,6 +204,28 @@ def _diagnose_light(
     findings += of_images + [one for one in suspects if not explained & set(one.frames)]
     out[list(moved)] = True
     return Diagnosis(tuple(findings), order, out, directions, strength)
+
+
+def _drop_refuted(
+    suspects: list[Finding],
+    stack: ReducedStack,
+    rows: Float64Array,
+    kept: NDArray[np.intp],
+    limit_deg: float,
+) -> list[Finding]:
+    """Drop wrong lights whose image fits its listed light on the surface of the other images."""
+    confirmed = []
+    for one in suspects:
+        if one.fault == WRONG:
+            (number,) = one.frames
+            valid, normals, albedo = _fit_surface(stack, rows, kept[kept != number])
+            good = valid & stack.usable[number]
+            light = fit_light(stack.gray[number], good, albedo[..., None] * normals)
+            length = float(np.linalg.norm(light))
+            if length > 0.0 and light @ rows[number] > length * np.cos(np.radians(limit_deg)):
+                continue
+        confirmed.append(one)
+    return confirmed
 
 
 def _find_in_images(
@@ -221,10 +247,7 @@ def _find_in_images(
         Images for the normals, and images that may have moved.
     """
     mask = stack.inside
-    maps = estimate_normals(stack.gray[used], rows[used], valid=stack.usable[used] & mask)
-    valid = maps.valid & mask
-    normals = np.where(valid[..., None], maps.normals, 0.0).astype(np.float64)
-    albedo = np.where(valid, maps.albedo, 0.0).astype(np.float64)
+    valid, normals, albedo = _fit_surface(stack, rows, used)
     shading = np.maximum(np.einsum("hwi,ni->nhw", normals, rows), 0.0)
     findings = list(axis_faults.find_axes(normals, valid))
     if not findings:  # wrong axes change shading along rows
@@ -233,9 +256,17 @@ def _find_in_images(
             stack.gray[used], stack.usable[used], valid, predicted
         )
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
-    scaled = albedo[..., None] * normals
-    moved = find_moved(stack.gray[kept], stack.usable[kept], valid, scaled, step=stack.step)
-    findings += [_renumbered(one, kept) for one in moved]
+
+    def fit_without(number: int) -> Float64Array:
+        others = used[used != kept[number]]
+        _, other_normals, other_albedo = _fit_surface(stack, rows, others)
+        return other_albedo[..., None] * other_normals
+
+    moved = find_moved(
+        stack.gray[kept], stack.usable[kept], valid, albedo[..., None] * normals,
+        fit_without=fit_without, step=stack.step,
+    )  # fmt: skip
+    findings += [one.renumber(kept) for one in moved]
     height, width = mask.shape
     places = np.argwhere(valid)
     places = places[rng.permutation(len(places))[:MAX_POINTS]]
@@ -251,9 +282,12 @@ def _find_in_images(
     return findings
 
 
-def _renumbered(one: Finding, numbers: NDArray[np.intp]) -> Finding:
-    """Return a finding about some of the images with the numbers of all."""
-    order = None
-    if one.order is not None and len(one.order) == len(numbers):
-        order = tuple(int(numbers[k]) for k in one.order)
-    return replace(one, frames=tuple(int(numbers[k]) for k in one.frames), order=order)
+def _fit_surface(
+    stack: ReducedStack, rows: Float64Array, used: NDArray[np.intp]
+) -> tuple[BoolArray, Float64Array, Float64Array]:
+    """Return valid pixels (H, W), normals (H, W, 3) and albedo (H, W) of some of the images."""
+    usable = stack.usable[used] & stack.inside
+    maps = estimate_normals(stack.gray[used], rows[used], valid=usable)
+    valid = maps.valid & stack.inside
+    normals = np.where(valid[..., None], maps.normals, 0.0).astype(np.float64)
+    return valid, normals, np.where(valid, maps.albedo, 0.0).astype(np.float64)

@@ -17,6 +17,8 @@ MIN_CURVE_MISFIT = 0.02
 """Misfit to equal lights from which another curve is considered."""
 CURVE_RATIO = 0.6
 """Ratio of misfits below which another curve is reported."""
+MAX_CURVE_MISFIT = 0.05
+"""Misfit under another curve, above which that curve does not explain the images either."""
 MAX_AMBIENT = 0.03
 """Light in attached shadows over the albedo."""
 SHADOW_COSINE = -0.15
@@ -31,6 +33,8 @@ MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
 """Twice half a width of the object over the distance of the lights, and its certainty."""
 STRENGTH_RANGE = (0.75, 1.35)
 MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
+MIN_CERTAIN_LIGHTS, MIN_DRIFT_OF_FEW = 12, 0.15
+"""Fewer lights have a larger limit: highlights change their strengths by 10 %."""
 MIN_FLICKER = 0.04
 """Spread of the light from line to line, relative, beyond that across the lines."""
 MIN_LIT = 0.5
@@ -84,7 +88,7 @@ def find_curve(
         for name, decode in CURVES_BY_NAME.items()
     }
     best = min(found, key=lambda name: found[name])
-    if found[best] < CURVE_RATIO * listed:
+    if found[best] < min(CURVE_RATIO * listed, MAX_CURVE_MISFIT):
         yield Finding(
             "transfer curve", (),
             f"equal lights fit to {found[best]:.1%} if these are {best}, else to {listed:.1%}",
@@ -261,7 +265,8 @@ def find_strengths(strength: Float64Array, right: BoolArray) -> Iterator[Finding
     if np.count_nonzero(kept) < MIN_TREND_LIGHTS:
         return
     slope, error, rest = fit_trend(strength, kept)
-    limit = max(MIN_DRIFT, MIN_DRIFT_SIGMAS * error)
+    least = MIN_DRIFT if len(strength) >= MIN_CERTAIN_LIGHTS else MIN_DRIFT_OF_FEW
+    limit = max(least, MIN_DRIFT_SIGMAS * error)
     drifts = abs(slope) > limit
     if drifts:
         yield Finding(

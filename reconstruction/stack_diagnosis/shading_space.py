@@ -22,6 +22,8 @@ HIGHLIGHT_FACTOR = 1.6
 """Of a point's bright sample: brighter samples count as highlights."""
 BRIGHT_QUANTILE = 0.85
 N_STEPS, N_PLAIN_STEPS = 30, 5
+START_FRACTION = 0.5
+"""Of the points, those lit by most lights, that are factored first."""
 TUKEY_CONSTANT = 4.7
 """Residual, in standard deviations, at which Tukey's biweight is zero."""
 N_FRAMES_PER_DRAW = 4
@@ -114,13 +116,36 @@ def choose_points(
 
 
 def fit_shading_space(samples: Float64Array, usable: BoolArray) -> ShadingSpace:
-    """Factor samples (N, P) by alternating weighted least squares with Tukey's biweight."""
+    """Factor samples (N, P) by alternating weighted least squares with Tukey's biweight.
+
+    The half of the points that most lights reach is factored first: where many points are in cast
+    shadow, a start from all of them can end with the lights of one side wrong.
+    """
     bright = np.quantile(np.where(usable, samples, 0.0), BRIGHT_QUANTILE, axis=0)
     kept = bright > 0.0
     scaled = samples[:, kept] / bright[kept]
-    lit = usable[:, kept] & (scaled > SHADOW_FRACTION) & (scaled < HIGHLIGHT_FACTOR)
-    left, size, _ = np.linalg.svd(np.where(usable[:, kept], scaled, 0.0), full_matrices=False)
-    lights = left[:, :3] * size[:3]
+    clear = usable[:, kept]
+    lit = clear & (scaled > SHADOW_FRACTION) & (scaled < HIGHLIGHT_FACTOR)
+    count = lit.sum(axis=0)
+    most = count >= np.quantile(count, 1.0 - START_FRACTION) if count.size else kept[kept]
+    left, size, _ = np.linalg.svd(np.where(clear, scaled, 0.0)[:, most], full_matrices=False)
+    first = _alternate(scaled[:, most], lit[:, most], left[:, :3] * size[:3], N_PLAIN_STEPS)
+    lights, points, weights, misfit = _alternate(scaled, lit, first[0], 0)
+    whole = np.zeros(samples.shape)
+    whole[:, kept] = weights
+    every = np.zeros((samples.shape[1], 3))
+    every[kept] = points
+    singular = np.linalg.svd(lights, compute_uv=False)
+    return ShadingSpace(lights, every, whole, misfit, float(singular[2] / singular[0]))
+
+
+def _alternate(
+    scaled: Float64Array, lit: BoolArray, lights: Float64Array, plain_steps: int
+) -> tuple[Float64Array, Float64Array, Float64Array, float]:
+    """Return lights (N, 3), points (P, 3), weights (N, P) and misfit of scaled samples (N, P).
+
+    The first steps, `plain_steps`, weight all lit samples alike.
+    """
     weights, misfit = lit.astype(np.float64), 1.0
     points = np.zeros((scaled.shape[1], 3))
     for step in range(N_STEPS):
@@ -128,16 +153,11 @@ def fit_shading_space(samples: Float64Array, usable: BoolArray) -> ShadingSpace:
         lights = _solve(weights, scaled, points)
         spread = np.linalg.cholesky(np.linalg.inv(points.T @ points / len(points) + _ridge(points)))
         points, lights = points @ spread, lights @ np.linalg.inv(spread).T
-        if step >= N_PLAIN_STEPS:
+        if step >= plain_steps:
             residual = scaled - lights @ points.T
             misfit = max(1.4826 * float(np.median(np.abs(residual[lit]))), 1e-5)
             weights = lit * np.maximum(1.0 - (residual / (TUKEY_CONSTANT * misfit)) ** 2, 0.0) ** 2
-    whole = np.zeros(samples.shape)
-    whole[:, kept] = weights
-    every = np.zeros((samples.shape[1], 3))
-    every[kept] = points
-    singular = np.linalg.svd(lights, compute_uv=False)
-    return ShadingSpace(lights, every, whole, misfit, float(singular[2] / singular[0]))
+    return lights, points, weights, misfit
 
 
 def _ridge(rows: Float64Array) -> Float64Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from model.arrays import Float64Array
 from reconstruction.pipeline.diagnosed_images import DiagnosedImages
+from reconstruction.stack_diagnosis import Finding
 from skinrig.console import format_count
 from skinrig.reporting import page
 from skinrig.reporting.map_images import draw_plain_image, shrink
@@ -43,12 +44,9 @@ def build_diagnosis_page(name: str, found: DiagnosedImages) -> str:
     if not faults:
         verdict = f"no fault in {count} images"
     lead: list[page.Block] = [page.Paragraph(f"{verdict}.")]
-    rows = [
-        (one.fault, found.name_images(one), one.ratio_to_limit, one.evidence, one.remedy)
-        for one in faults
-    ]
+    rows = [(one.fault, found.name_images(one), f"{one.ratio_to_limit:.1f}") for one in faults]
     if rows:
-        head = ("fault", "images", "over its limit", "evidence", "remedy")
+        head = ("fault", "images", "evidence over its limit")
         lead.append(page.build_table(head, rows, caption="The most certain fault comes first"))
     if found.assumed:
         lead.append(page.Bullets([f"assumed: {text}" for text in found.assumed]))
@@ -59,17 +57,25 @@ def _sections(found: DiagnosedImages) -> Iterator[page.Block]:
     count = len(found.names)
     level = _find_level(found)
     for one in found.findings:
-        yield page.Heading(one.fault, 2)
-        yield page.Paragraph(f"{one.evidence}. Remedy: {one.remedy}.")
+        yield page.Heading(f"{one.fault}: {_name_images(found, one)}", 2)
+        yield page.Paragraph(f"{one.evidence[:1].upper()}{one.evidence[1:]}. Remedy: {one.remedy}.")
         numbers = list(one.frames) or list(range(0, count, _step(count)))
         shown = [_draw_image(found, number, level) for number in numbers[:MAX_SHOWN]]
         if found.diagnosis is None:  # side by side: each is one image
             shown = [[image for images in shown for image in images]]
         for images in shown:
-            yield page.Images(images)
+            yield page.Images(images, together=True)
         left = len(numbers) - MAX_SHOWN
         if left > 0 and one.frames:
             yield page.build_note(f"{left} more images have this fault.")
+
+
+def _name_images(found: DiagnosedImages, one: Finding) -> str:
+    """Return the names of a finding's images; those of a light list are numbers."""
+    if not one.frames:
+        return "all images"
+    word = "" if found.diagnosis is None else "image " if len(one.frames) == 1 else "images "
+    return word + found.name_images(one)
 
 
 def _find_level(found: DiagnosedImages) -> float:

@@ -178,6 +178,8 @@ class Images(Block):
 
     images: Sequence[Image]
     small: bool = False
+    together: bool = False
+    """Whether up to three images stay in one row on narrow screens, to be compared."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Average the frames of one polarizer state of the flash rig."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +62,7 @@ def make_image_reader(
         name = records[0].index.get("polarizer") or records[0].index["light"]
         expected = "one camera setting; choose frames of one"
         Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
-        power = sum(float(record.settings.get("power", 1.0)) for record in records)
+        power = sum(relative_light(record.settings) for record in records)
         rgb = total(linear, "rgb") - len(linear) * dark
         variance = total(linear, "variance") + len(linear) ** 2 * dark_variance
         return FlashImage(
@@ -73,6 +73,17 @@ def make_image_reader(
         )
 
     return mean_image
+
+
+def relative_light(settings: Mapping[str, Any]) -> float:
+    """Return the power of the flash, or the exposure of a photograph over its partner's.
+
+    Examples
+    --------
+    >>> relative_light({"power": 0.5}), relative_light({"relative_exposure": 2.0})
+    (0.5, 2.0)
+    """
+    return float(settings.get("power", 1.0)) * float(settings.get("relative_exposure", 1.0))
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray
 from reconstruction.pipeline.diagnosed_images import DiagnosedImages, ImageGroup, collect_images
+from reconstruction.pipeline.flash.mean_frames import relative_light
 from reconstruction.pipeline.inputs import InputsError
 from reconstruction.pipeline.linear_frame import read_linear
 from reconstruction.stack_diagnosis.polarized_pairs import find_pair_faults
@@ -77,7 +78,7 @@ def _name(record: FrameRecord) -> str:
 def _diagnose_pair(session: Session, pair: Pair) -> ImageGroup:
     frames = [session.read(record) for record in pair]
     values, usable = zip(*map(read_linear, frames), strict=True)
-    power = [float(record.settings.get("power", 1.0)) for record in pair]
+    power = [relative_light(record.settings) for record in pair]
     parallel, crossed = (one / factor for one, factor in zip(values, power, strict=True))
     names = [_name(record) for record in pair]
     return diagnose_pair(parallel, crossed, usable[0] & usable[1], frames[0].neutral, names)
@@ -95,7 +96,7 @@ def diagnose_pair(
     Parameters
     ----------
     parallel, crossed
-        (H, W, C) of one or three channels, linear, over the power of the flash.
+        (H, W, C) of one or three channels, linear, over the power of the flash or the exposure.
     usable
         (H, W), False where an image is saturated.
     neutral

@@ -14,11 +14,15 @@ from fixtures.faulty_stacks import FAULTS, GRADED, make
 from model.metrics import angular_error_rad
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals
-from reconstruction.stack_diagnosis import diagnose_stack, light_labels, moved_images
+from reconstruction.stack_diagnosis import diagnose_stack, diagnosis, light_labels, moved_images
 from reconstruction.stack_diagnosis.shading_space import Agreement
 
 NAMED_ALONE = {"two swapped", "dim", "zeros", "dark", "half of zeros", "mirrored"}
 """Faults from which nothing else follows: no other finding is expected."""
+
+
+def named(stack):
+    return [(one.fault, one.frames) for one in diagnose(stack).findings]
 
 
 def diagnose(stack, **options):
@@ -103,6 +107,60 @@ def test_proposed_order_restores_the_normals():
     assert listed > 3.0
 
 
+@pytest.mark.parametrize(
+    ("fault", "seed", "rig", "tone", "severity"),
+    [
+        ("moved", 110561, "gradient", "light", 5.0),  # a ball: its shading follows the shift
+        ("moved", 110216, "dome", "dark", 2.0),
+        ("moved", 110474, "flash", "dark", 2.0),
+        ("moved", 122464, "gradient", "medium", 2.0),  # grazing light: most samples are dark
+    ],
+)
+def test_move_of_smooth_object_is_found(fault, seed, rig, tone, severity):
+    stack = make(fault, seed, rig=rig, tone=tone, severity=severity, side=64)
+    (one,) = diagnose(stack).findings
+    assert (one.fault, one.frames) == ("moved image", stack.frames)
+    assert 0.5 * severity < one.measured < 1.5 * severity
+
+
+@pytest.mark.parametrize("seed", [110524, 110677, 110683])
+def test_relief_under_grazing_light_is_sound(seed):
+    """Most of its samples are in cast shadow: an image there fits nothing, wherever it is."""
+    tone = "light" if seed == 110524 else "medium"
+    assert diagnose(make("", seed, rig="gradient", tone=tone, side=64)).findings == ()
+
+
+def test_text_names_images_among_all():
+    """Rules see the images that are not left out; their texts count all images."""
+    stack = make("one wrong", 300, side=64, count=12)
+    (number,) = stack.frames
+    empty = 0 if number else 1
+    stack.images[empty] = 0.0
+    found = {one.fault: one for one in diagnose(stack).findings}
+    assert found["empty image"].frames == (empty,)
+    assert found["wrong light"].frames == (number,)
+    assert found["wrong light"].evidence.startswith(f"image {number + 1} is lit")
+
+
+def test_few_images_refute_light_of_highlights(monkeypatch):
+    """The other images' surface explains the image by its listed light, or does not."""
+    stack = make("one wrong", 306, side=64, count=8)
+    assert ("wrong light", stack.frames) in named(stack)
+    listed = stack.lights.copy()
+    sound = replace(stack, lights=make("", 306, side=64, count=8).lights)
+    (number,) = stack.frames
+    wrong = light_labels.Finding("wrong light", (number,), "", 12.0, 6.0, "")
+    order = light_labels.find_order
+
+    def suspect(*given):
+        found, agreement, _ = order(*given)
+        return found, agreement, [wrong]
+
+    monkeypatch.setattr(diagnosis, "find_order", suspect)
+    assert named(sound) == []
+    assert ("wrong light", (number,)) in named(replace(stack, lights=listed))
+
+
 def test_left_out_images_are_the_wrong_ones():
     for fault in ("zeros", "one wrong", "moved", "all lights on"):
         stack = make(fault, 300, side=64, count=12)
@@ -132,7 +190,9 @@ def test_image_of_few_lit_samples_is_not_compared():
     normals = np.broadcast_to([0.0, 0.0, 0.5], (24, 24, 3))
     usable = np.ones((2, 24, 24), bool)
     for images in (np.array([image, 0.0 * image]), -1.0 + 0.0 * np.array([image, image])):
-        assert not list(moved_images.find_moved(images, usable, inside, normals))
+        assert not list(
+            moved_images.find_moved(images, usable, inside, normals, fit_without=lambda _: normals)
+        )
 
 
 def test_near_lists_are_not_judged_by_one_direction():

@@ -37,3 +37,14 @@ def test_page_without_faults_names_number_of_images():
     sound = type(found)((), found.order, found.left_out, found.directions, found.strength)
     page = build_diagnosis_page("s", with_images(sound, stack))
     assert f"no fault in {len(stack.images)} images" in page
+
+
+def test_page_of_single_image_names_it_in_heading():
+    stack = make("zeros", 3)
+    found = diagnose_stack(
+        stack.images, stack.lights, inside=stack.inside, rng=np.random.default_rng(0)
+    )
+    page = build_diagnosis_page("s", with_images(found, stack))
+    (number,) = stack.frames
+    assert f"empty image: image {number + 1}" in page
+    assert f"Image {number + 1} has one value everywhere. Remedy: take" in page
