@@ -172,7 +172,7 @@ def _run_git(
 ) -> subprocess.CompletedProcess[bytes]:
     place = () if git_dir is None else (f"--git-dir={git_dir}",)
     environment = os.environ | GIT_ENVIRONMENT
-    if words[0] in ("clone", "checkout", "fetch"):
+    if {"clone", "checkout", "fetch"} & set(words):
         del environment["GIT_NO_LAZY_FETCH"]
     try:
         done = subprocess.run(
@@ -186,7 +186,7 @@ def _run_git(
         raise FetchError("git: not found; install git") from error
     if check and done.returncode:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"]
-        raise FetchError(f"git {words[0]}: {lines[-1]}")
+        raise FetchError(f"git {next(w for w in words if w[0] != '-')}: {lines[-1]}")
     return done
 
 
@@ -223,7 +223,9 @@ def _clone(one: RealSet, clone: Path, url_form: str, paths: Iterable[str]) -> Pa
         _run_git(git_dir, "fetch", "--quiet", "--filter=blob:none", "origin", one.commit)
     patterns = "".join("/" + re.sub(r"([*?\[\]\\ ])", r"\\\1", path) + "\n" for path in paths)
     work = f"--work-tree={clone}"
-    _run_git(git_dir, work, "sparse-checkout", "set", "--no-cone", "--stdin", data=patterns.encode())
+    _run_git(
+        git_dir, work, "sparse-checkout", "set", "--no-cone", "--stdin", data=patterns.encode()
+    )
     (git_dir / "index.lock").unlink(missing_ok=True)  # of a killed run
     _run_git(git_dir, work, "checkout", "--quiet", "--force", "--detach", one.commit)
     return git_dir

