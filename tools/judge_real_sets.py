@@ -392,6 +392,8 @@ FACE_NUMBERS = (1, 2, 3, 4, 6, 7, 8)
 """LEDs whose photographs are pinned; that of LED 5 is larger than what was verified."""
 FACE_DISTANCE_MM = 700.0
 FACE_REDUCTION = 8
+MAX_FACE_UNFIT = 0.2
+"""Of the pixels: those without a normal that faces the camera."""
 
 
 def load_face(sets: Path) -> tuple[Array, Array, Array, float, Array]:
@@ -423,22 +425,41 @@ def load_face(sets: Path) -> tuple[Array, Array, Array, float, Array]:
     return gray, small, lights["S"][at] * flip, float(matrix[0, 0]) / FACE_REDUCTION, center
 
 
-def judge_face(sets: Path) -> Iterator[Figure]:
-    """Yield residuals of a face under near lights, as such and as distant ones; no truth exists."""
-    gray, mask, positions, focal_px, center = load_face(sets)
-    y, x = np.mgrid[0 : mask.shape[0], 0 : mask.shape[1]].astype(np.float64)
-    rays = np.stack([(x - center[0]) / focal_px, (center[1] - y) / focal_px, -np.ones_like(x)], -1)
-    points = FACE_DISTANCE_MM * rays
+def fit_face(gray: Array, mask: Array, points: Array, positions: Array) -> tuple[Array, Array]:
+    """Return median residual over albedo, and the fraction of pixels without a facing normal.
+
+    Both are (2,): with the lights taken as distant, and as near.
+    """
     distant = unit_vectors(positions - points[mask].mean(axis=0))
-    residuals = []
     near_lights: dict[str, Any] = {"light_positions_mm": positions, "points_mm": points}
+    residual, unfit = [], []
     for near in ({}, near_lights):
         maps = estimate_normals(gray, distant, valid=mask, robust=False, **near)
         good = maps.valid & mask
-        residuals.append(float(np.median(maps.residual[good] / maps.albedo[good])))
-    far, close = residuals
-    yield Figure("face", "median residual over albedo, distant lights", None, far, np.inf)
-    yield Figure("face", "median residual over albedo, near lights", None, close, 0.8 * far)
+        residual.append(np.median(maps.residual[good] / maps.albedo[good]))
+        unfit.append(1.0 - np.count_nonzero(maps.normals[good][:, 2] > 0.0) / mask.sum())
+    return np.array(residual), np.array(unfit)
+
+
+def face_points_mm(mask: Array, focal_px: float, center: Array) -> Array:
+    """Return the pixels' points (H, W, 3) on a plane across the view."""
+    y, x = np.mgrid[0 : mask.shape[0], 0 : mask.shape[1]].astype(np.float64)
+    rays = [(x - center[0]) / focal_px, (center[1] - y) / focal_px, -np.ones_like(x)]
+    return FACE_DISTANCE_MM * np.stack(rays, axis=-1)
+
+
+def judge_face(sets: Path) -> Iterator[Figure]:
+    """Yield how well near and distant lights explain a face; no truth exists."""
+    gray, mask, positions, focal_px, center = load_face(sets)
+    points = face_points_mm(mask, focal_px, center)
+    residual, unfit = fit_face(gray, mask, points, positions)
+    for number, kind in enumerate(("distant", "near")):
+        limits = (np.inf, np.inf) if kind == "distant" else (0.8 * residual[0], MAX_FACE_UNFIT)
+        text = f"median residual over albedo, {kind} lights"
+        yield Figure("face", text, None, float(residual[number]), float(limits[0]))
+        text = f"pixels without a normal to the camera, {kind} lights"
+        yield Figure("face", text, None, float(unfit[number]), limits[1])
+    distant = unit_vectors(positions - points[mask].mean(axis=0))
     found = diagnose_stack(gray, distant, inside=mask, rng=np.random.default_rng(0))
     missed = float(not found.findings)
     yield Figure("face", "near lights taken for distant, not found", None, missed, 0.0)

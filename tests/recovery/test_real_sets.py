@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.vectors import unit_vectors
 from reconstruction.normal_integration import integrate_map
 from reconstruction.photometric_stereo import estimate_normals
 
@@ -86,13 +85,15 @@ def test_wrong_lists_of_photographs_are_found(tmp_path, name):
 def test_near_lights_explain_face_better():
     real_sets = find_sets("near-face")
     shown = require_limits(TOOL.judge_face(real_sets))
-    distant = shown["median residual over albedo, distant lights"]
-    assert distant.ours > shown["median residual over albedo, near lights"].limit
-    gray, mask, positions, *_ = TOOL.load_face(real_sets)
-    turned = unit_vectors(positions[::-1] + np.array([0.0, 0.0, TOOL.FACE_DISTANCE_MM]))
-    maps = estimate_normals(gray, turned, valid=mask, robust=False)
-    good = maps.valid & mask
-    assert np.median(maps.residual[good] / maps.albedo[good]) > distant.ours
+    distant = shown["pixels without a normal to the camera, distant lights"]
+    assert distant.ours > TOOL.MAX_FACE_UNFIT
+    limit = shown["median residual over albedo, near lights"].limit
+    gray, mask, positions, *view = TOOL.load_face(real_sets)
+    points = TOOL.face_points_mm(mask, *view)
+    for order in (np.roll(positions, 1, axis=0), positions[::-1]):
+        residual, unfit = TOOL.fit_face(gray, mask, points, order)
+        assert residual[1] > limit
+        assert unfit[1] > TOOL.MAX_FACE_UNFIT
 
 
 def test_metal_height_follows_from_normals():
