@@ -212,6 +212,11 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(
             f"{wanting} tests skipped for want of test data (SKINRIG_TEST_DATA)"
         )
+    wanting = sum("real set not found" in str(report.longrepr) for report in reports)
+    if wanting:
+        terminalreporter.write_line(
+            f"{wanting} tests skipped for want of public data sets (SKINRIG_REAL_SETS)"
+        )
     real_time.pytest_terminal_summary(terminalreporter)
     if config.getoption("record_durations"):
         seconds = {path: spent for path, spent in recorded_durations_s().items() if path.is_file()}

@@ -32,6 +32,9 @@ OTHER_KINDS = {
     "Photoshop file": ((b"8BPS",), (".psd", ".psb")),
     "JPEG XL image": ((b"\xff\x0a",), (".jxl",)),
     "JPEG 2000 image": ((b"\0\0\0\x0cjP",), (".jp2", ".j2k")),
+    "Targa image": ((), (".tga",)),
+    "Netpbm image": ((), (".pgm", ".ppm", ".pnm")),
+    "NumPy array": ((b"\x93NUMPY",), (".npy",)),
 }
 """Formats that are not read: first bytes, or the brand of ISO base media or RIFF, and suffixes."""
 OTHER_IMAGE_SUFFIXES = frozenset(one for _, suffixes in OTHER_KINDS.values() for one in suffixes)

@@ -46,7 +46,11 @@ def read_text(path: Path) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", "replace")
     if b"\0" in data:
-        raise LightListError("is not a light list", where=str(path))
+        raise LightListError(
+            "is not a light list",
+            where=str(path),
+            advice="Save its vectors as text, one line x y z per light, as JSON or as .npy.",
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

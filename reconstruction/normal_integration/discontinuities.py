@@ -100,12 +100,15 @@ class BilateralSettings:
         Relative change of the energy at which the rounds end, >= 0.
     inner : int
         Largest number of conjugate gradient iterations per round, >= 1.
+    min_ray_cosine : float
+        See `IntegrationSettings`.
     """
 
     sharpness: float = 2.0
     rounds: int = 150
     stop: float = 1e-4
     inner: int = 2
+    min_ray_cosine: float = slope_fields.MIN_RAY_COSINE
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
@@ -113,6 +116,7 @@ class BilateralSettings:
         check.settings(
             self, sharpness="(0, inf)", rounds="[1, inf)", stop="[0, 1)", inner="[1, inf)"
         )
+        check.settings(self, min_ray_cosine="(0, 1)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +193,12 @@ def integrate_with_discontinuities(
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
     chosen = settings or BilateralSettings()
     slopes = slope_fields.from_normals(
-        normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
+        normals,
+        valid=valid,
+        stderr_rad=stderr_rad,
+        y_up=y_up,
+        camera=camera,
+        min_ray_cosine=chosen.min_ray_cosine,
     )
     ux, uy = _confidence(slopes)
     ax, ay, dx, dy = slope_fields.edges(slopes, order=2)

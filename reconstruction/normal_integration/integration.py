@@ -45,15 +45,20 @@ class IntegrationSettings:
         Largest number of conjugate gradient iterations, >= 1.
     order : int
         Order of the quadrature between pixels: 4, or 2 for the mean of two neighbors.
+    min_ray_cosine : float
+        Least cosine between normal and ray of a usable pixel, in (0, 1). Steps of depth lie in the
+        pixels below it: 0.002 keeps most steps, but accepts slopes of up to 500.
     """
 
     tolerance: float = 1e-5
     iterations: int = 1000
     order: int = 4
+    min_ray_cosine: float = slope_fields.MIN_RAY_COSINE
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
         Checks(IntegrationError).settings(self, tolerance="(0, 1)", iterations="[1, inf)")
+        Checks(IntegrationError).settings(self, min_ray_cosine="(0, 1)")
         Checks(IntegrationError).choice("Settings.order", self.order, (2, 4))
 
 
@@ -105,7 +110,7 @@ def integrate(
         mean height, so that the camera's distance is `pixel * focal_px`.
     valid : ndarray of bool, shape (..., H, W), optional
         Pixels to integrate. Those whose normal is 0, not finite or more than 88.8 degrees from
-        the ray are omitted in addition.
+        the ray (`IntegrationSettings.min_ray_cosine`) are omitted in addition.
     stderr_rad : float or ndarray, shape (..., H, W), optional
         Standard error of the normals, rad (root mean square angle). Slopes are then weighted by
         their inverse variance, which rises towards the horizon. Errors are clipped to a thousandth
@@ -223,7 +228,12 @@ def integrate_map(
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
     chosen = settings or IntegrationSettings()
     slopes = slope_fields.from_normals(
-        normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
+        normals,
+        valid=valid,
+        stderr_rad=stderr_rad,
+        y_up=y_up,
+        camera=camera,
+        min_ray_cosine=chosen.min_ray_cosine,
     )
     if denoise:
         slopes = denoise_slopes(slopes, strength=denoise)

@@ -18,7 +18,7 @@ from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
 MIN_RAY_COSINE = 0.02
-"""Least cosine between normal and ray of a usable pixel: 88.9 degrees."""
+"""Default of the least cosine between normal and ray of a usable pixel: 88.9 degrees."""
 MAX_STDERR_RATIO = 1e3
 """Standard errors are clipped to their median times this and over this."""
 _MAX_VARIANCE_RATIO = 10.0
@@ -73,9 +73,10 @@ class SlopeField:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid):  # type: ignore[no-untyped-def]
+def _slopes(n, relative, cx, cy, per_focal, up, least, gx, gy, vx, vy, facing, valid):  # type: ignore[no-untyped-def]
     """Write slopes and variances of valid pixels; make those without a slope invalid.
 
+    ``least``: least cosine between normal and ray.
     ``relative``: variance of angles, (H, W) or (1, 1), read where vx is (H, W). A turn of n by an
     angle of variance s^2 in a random direction changes g = -n_x / m, m = n . w, by a vector with
     variance s^2 |n|^2 |m e_x - n_x w|^2 / (2 m^4).
@@ -94,7 +95,7 @@ def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid): 
             m = z + x * wx + y * wy
             w2 = 1.0 + wx * wx + wy * wy
             good = good and length2 > 0.0 and length2 < np.inf
-            good = good and m > 0.0 and m * m > MIN_RAY_COSINE * MIN_RAY_COSINE * length2 * w2
+            good = good and m > 0.0 and m * m > least * least * length2 * w2
             valid[i, j] = good
             if not good:
                 gx[i, j], gy[i, j], facing[i, j] = 0.0, 0.0, 0.0
@@ -117,8 +118,11 @@ def from_normals(
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
+    min_ray_cosine: float = MIN_RAY_COSINE,
 ) -> SlopeField:
     """Compute slopes of normals; see `normal_integration.integrate` for the parameters.
+
+    `min_ray_cosine` is that of the settings of an integration.
 
     Raises
     ------
@@ -152,6 +156,7 @@ def from_normals(
         float(cy),
         1.0 / camera.focal_px if camera else 0.0,
         1.0 if y_up else -1.0,
+        float(min_ray_cosine),
         gx,
         gy,
         vx,

@@ -49,8 +49,9 @@ SMOOTHING_PX = 1.0
 N_STEPS = 20
 SOFT_STRENGTH = 0.05
 """Deviation from equal strength up to which a light counts fully."""
-MIN_STRENGTH_SPREAD = 0.005
-"""Of the logarithm: no lights are more alike."""
+MIN_STRENGTH_SPREAD = 0.05
+"""Of the logarithm: a bas-relief map hides larger differences of real lamps (6 % of a gray ball's).
+"""
 MIN_INFORMATION = 1e-9
 """Of a parameter of the bas-relief map, where the strengths do not depend on it."""
 PROFILE_FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8, 4.0)

@@ -262,3 +262,19 @@ def test_intensities_follow_rows_of_named_list(name, tmp_path):
     np.savetxt(strengths, rows[:5])
     with pytest.raises(LightListError, match="does not fit the lights"):
         light_lists.find_light_list(tmp_path / "f")
+
+
+@pytest.mark.parametrize("suffix", [".tga", ".npy", ".pgm"])
+def test_folders_of_other_formats_name_the_conversion(tmp_path, suffix):
+    for number in range(4):
+        (tmp_path / f"{number}{suffix}").write_bytes(b"\x93NUMPY")
+    with pytest.raises(LightListError, match=r"4 \\?" + suffix) as caught:
+        light_lists.find_light_list(tmp_path)
+    assert "Convert it to TIFF or PNG" in str(caught.value)
+
+
+def test_matlab_lights_name_formats_that_are_read(tmp_path):
+    write(tmp_path / "f", sphere(directions(6))[0])
+    (tmp_path / "light.mat").write_bytes(b"MATLAB 5.0 MAT-file\0\0")
+    with pytest.raises(LightListError, match=r"as JSON or as \.npy"):
+        light_lists.find_light_list(tmp_path / "f", lights=tmp_path / "light.mat")
