@@ -109,7 +109,7 @@ def integrate(
         Size of a pixel on the surface; its unit is that of the height. Under perspective, at the
         mean height, so that the camera's distance is `pixel * focal_px`.
     valid : ndarray of bool, shape (..., H, W), optional
-        Pixels to integrate. Those whose normal is 0, not finite or more than 88.8 degrees from
+        Pixels to integrate. Those whose normal is 0, not finite or more than 89.9 degrees from
         the ray (`IntegrationSettings.min_ray_cosine`) are omitted in addition.
     stderr_rad : float or ndarray, shape (..., H, W), optional
         Standard error of the normals, rad (root mean square angle). Slopes are then weighted by
