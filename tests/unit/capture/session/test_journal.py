@@ -6,6 +6,7 @@ from capture.session.errors import SessionDamage, SessionError
 from capture.session.journal import (
     MAX_LINE_BYTES,
     CloseLine,
+    FrameLine,
     OmissionLine,
     seal_bounded_line,
     seal_line,
@@ -28,6 +29,28 @@ def seal_lines(*lines):
 def test_omission_line_needs_different_names(steps):
     with pytest.raises(SessionDamage, match="steps"):
         OmissionLine(steps=steps, reason="blinked", about={}, t_host_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("step", "../S001"),
+        ("camera", "../cam"),
+        ("attempt", 0),
+        ("file", "frames/S002+cam.dng"),
+        ("bytes", 0),
+        ("xxh128", "0" * 31),
+    ],
+)
+def test_frame_line_refuses_impossible_values(field, value):
+    good = {
+        **{"step": "S001", "camera": "cam", "attempt": 1, "file": "frames/S001+cam.dng"},
+        **{"bytes": 1, "xxh128": "0" * 32, "settings": {}, "actual": {}},
+        **{"t_box_s": None, "t_host_s": 1.0},
+    }
+    FrameLine(**good)
+    with pytest.raises(SessionDamage, match=rf"\n  {field}: got "):
+        FrameLine(**good | {field: value})
 
 
 def test_data_after_end_is_damage():
