@@ -12,6 +12,8 @@ python tools/fuzz_readers.py --readers "" (totals)
 
 import argparse
 import csv
+import functools
+import logging
 import re
 import resource
 import subprocess
@@ -19,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from concurrent import futures
 from pathlib import Path
 from types import FunctionType
 
@@ -76,6 +79,28 @@ def find_functions() -> list[FunctionType]:
     return list(found.values())
 
 
+class SerialPool(futures.Executor):
+    """Pool without threads, whose start takes longer than the reading of a small file."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def map(self, function, *lists, **_):
+        """Return the results as an iterator, as a pool does."""
+        return map(function, *lists)
+
+
+def keep_unchanged_parts(reader: str) -> None:
+    """Decode the files of a session once that are not fuzzed; each has a reader of its own."""
+    from capture.session import contents, verification
+
+    if reader in ("SESSION journal", "SESSION frame"):
+        contents.decode = functools.lru_cache(contents.decode)
+        verification.ThreadPoolExecutor = SerialPool
+    if reader == "SESSION frame":
+        contents.walk_journal = functools.lru_cache(contents.walk_journal)
+
+
 def fuzz(reader: str, seed: int, runs: int, budget_s: float, place: Path) -> None:
     """Read mutated files in this process, which ends with the last run or the first failure."""
     import atheris
@@ -89,6 +114,8 @@ def fuzz(reader: str, seed: int, runs: int, budget_s: float, place: Path) -> Non
     for function in find_functions():
         atheris.instrument_func(function)
     form = FORMATS[reader]
+    logging.disable()  # texts of the libraries, which take longer than the reading
+    keep_unchanged_parts(reader)
     path = write_good(place / "read", form)
     good = path.read_bytes()[:MAX_FILE_BYTES]  # of MERL's 35 MB, the head
     corpus = place / "corpus"
@@ -102,8 +129,9 @@ def fuzz(reader: str, seed: int, runs: int, budget_s: float, place: Path) -> Non
             (place / "failure.bin").write_bytes(data)
             raise AssertionError(unclear)
 
-    def change(data: bytes, max_size: int, draw: int) -> bytes:
-        rng = np.random.default_rng(draw)
+    rng = np.random.default_rng(seed)
+
+    def change(data: bytes, max_size: int, _: int) -> bytes:
         own = rng.random() < 0.5
         return (mutate(data, rng) if own else atheris.Mutate(data, max_size))[:max_size]
 
@@ -176,7 +204,7 @@ def sum_runs() -> tuple[Counter[str], Counter[str], Counter[str]]:
 
 
 def fuzz_to(reader: str, wanted: int, budget_s: float) -> None:
-    """Fuzz a reader until the table has the wanted runs, or the seconds are over."""
+    """Fuzz a reader until the table has the wanted runs, a file fails, or the seconds are over."""
     begun_s = time.monotonic()
     while (left := wanted - sum_runs()[0][reader]) > 0:
         left_s = budget_s - (time.monotonic() - begun_s)
@@ -187,6 +215,8 @@ def fuzz_to(reader: str, wanted: int, budget_s: float) -> None:
         row = run_child(reader, seed, min(left, PART_RUNS), min(left_s, PART_S))
         add_row(row)
         print(f"{reader}: seed {seed}, {row['runs']} runs in {row['seconds']} s", flush=True)
+        if row["failures"]:
+            return
 
 
 def main() -> None:

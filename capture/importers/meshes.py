@@ -212,7 +212,10 @@ def _decode(data: bytes, kind: str, source: Path) -> _Arrays:
 
     try:
         # a stream and not a path: files named inside (materials, textures) are not opened
-        loaded: Any = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+        stream: io.BytesIO | io.StringIO = io.BytesIO(data)
+        if kind == "obj":  # names and comments of unknown encoding: the library would guess it
+            stream = io.StringIO(data.decode("utf-8-sig", "replace"))
+        loaded: Any = trimesh.load_scene(stream, file_type=kind, process=False)
         parts = [part for part in loaded.dump() if hasattr(part, "faces")]
     except Exception as exc:  # the readers raise whatever their parsers raise
         reason = str(exc).splitlines()[0] if str(exc) else type(exc).__name__

@@ -123,6 +123,12 @@ class Faults:
     """Probability that a camera returns its previous frame first."""
     drop_frame: Probability = 0.0
     """Probability that a frame is lost."""
+    late_frame: Probability = 0.0
+    """Probability that a frame is late; it comes even if the camera was armed again meanwhile."""
+    repeat_frame: Probability = 0.0
+    """Probability that a frame comes a second time, late."""
+    late_frame_s: Seconds = 6.0
+    """Largest delay of a late frame after its read-out, s."""
     wrong_camera: Probability = 0.0
     """Probability that a frame carries another camera's serial number."""
     wrong_exposure: Probability = 0.0

@@ -43,6 +43,8 @@ class _Shot:
     seq: int
     start_s: float
     exposure: Exposure
+    late_s: float = 0.0
+    """Delay after the read-out, s; a late frame is under way, and cannot be dropped."""
 
     @property
     def end_s(self) -> float:
@@ -120,6 +122,7 @@ class CameraBody:
         self.exposure = Exposure(0.01, 100)
         self.missed_edges = 0
         self._rng = world.rng_for("camera", view.name)
+        self._delays = world.rng_for("late frames", view.name)
         self._armed = 0
         self._trigger = Trigger.SOFTWARE
         self._seq = 0
@@ -152,7 +155,7 @@ class CameraBody:
         if trigger not in self.info.triggers:
             raise CameraError(f"camera {self.info.serial}: does not support {trigger} triggers")
         with self.world.lock:
-            self._waiting.clear()
+            self._drop_waiting()
             if self._previous is not None and self._rng.random() < self.world.faults.stale:
                 self._waiting.append(self._previous)
             self._armed, self._trigger, self._seq = count, trigger, 0
@@ -161,7 +164,10 @@ class CameraBody:
         """Cancel armed exposures; an exposure that has begun is dropped."""
         with self.world.lock:
             self._armed = 0
-            self._waiting.clear()
+            self._drop_waiting()
+
+    def _drop_waiting(self) -> None:
+        self._waiting = deque(shot for shot in self._waiting if shot.late_s > 0.0)
 
     def close(self) -> None:
         """Release the camera; its state persists."""
@@ -203,7 +209,20 @@ class CameraBody:
         self._armed -= 1
         self._busy_until = shot.end_s + self.view.readout_s
         if self._rng.random() >= self.world.faults.drop_frame:
+            self._send(shot)
+
+    def _send(self, shot: _Shot) -> None:
+        """Put a frame on its way: in time, late, or in time and late again."""
+        faults = self.world.faults
+        chance = self._delays.random()
+        late = dataclasses.replace(shot, late_s=faults.late_frame_s * self._delays.uniform(0.01, 1))
+        if chance >= faults.late_frame:
             self._waiting.append(shot)
+        if chance < faults.late_frame + faults.repeat_frame:
+            self._waiting.append(late)
+
+    def _ready_s(self, shot: _Shot) -> float:
+        return shot.end_s + self.view.readout_s + shot.late_s
 
     def next_shot(self, timeout_s: float) -> _Shot:
         """Wait until the next frame has been read out."""
@@ -212,10 +231,13 @@ class CameraBody:
         while True:
             with world.lock:
                 world.advance(world.now)
-                ready = self._waiting[0].end_s + self.view.readout_s if self._waiting else math.inf
-                if ready <= world.now:
-                    self._previous = self._waiting.popleft()
-                    return self._previous
+                # late frames are overtaken: the earliest comes first
+                first = min(self._waiting, key=self._ready_s, default=None)
+                ready = math.inf if first is None else self._ready_s(first)
+                if first is not None and ready <= world.now:
+                    self._waiting.remove(first)
+                    self._previous = dataclasses.replace(first, late_s=0.0)
+                    return first
                 now = world.now
             if now >= until:
                 raise FrameTimeout(f"camera {self.view.serial}: no frame in {timeout_s:g} s")

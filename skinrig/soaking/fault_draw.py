@@ -21,6 +21,11 @@ MAX_CLOCK_JUMP_S = 7200.0
 WEAK_LED_SHARE = 0.3
 """Days of a rig with an LED that emits less than requested, relative to all."""
 
+LATE_FRAME_SHARE = 0.1
+"""Days of a rig with late and repeated frames, relative to all."""
+MAX_LATE_FRAME_S = 12.0
+"""Largest delay, s; hosts wait for a frame for 3 or 5 s beyond its read-out."""
+
 
 @dataclass(frozen=True, slots=True)
 class HostFault:
@@ -99,4 +104,7 @@ def draw_rig_faults(rng: np.random.Generator, lights: int) -> Faults:
     own = rng.spawn(1)[0]
     if own.random() < WEAK_LED_SHARE:
         drawn["led_weak"] = f"{own.integers(lights)}={own.integers(2, 10) / 10}"
+    if own.random() < LATE_FRAME_SHARE:
+        drawn |= {"late_frame": 0.1, "repeat_frame": 0.1}
+        drawn["late_frame_s"] = float(own.uniform(1.0, MAX_LATE_FRAME_S))
     return Faults(**drawn)

@@ -94,6 +94,14 @@ def test_weak_led_is_filed_and_would_be_noticed(monkeypatch):
     assert "no frame is filed under a wrong light" in failure
 
 
+def test_soak_begins_no_day_after_its_budget(monkeypatch):
+    spent_s = [0.0]
+    monkeypatch.setattr(soak, "_soak_day", lambda *_: spent_s.append(spent_s[-1] + 50.0))
+    monkeypatch.setattr(soak.time, "process_time", lambda: spent_s[-1])
+    result = run_soak(5, hours=2400.0, budget_s=170.0)
+    assert (result.days, result.processor_s) == (4, 200.0)
+
+
 @pytest.mark.parametrize("option", [("--hours", "-1"), ("--hours", "nan"), ("--budget", "0")])
 def test_soak_refuses_unusable_numbers(option, capsys):
     assert main(["soak", *option]) == 3

@@ -102,6 +102,8 @@ def check(world, session):
         {"misfire": 0.15},
         {"stale": 0.5},
         {"drop_frame": 0.1},
+        {"late_frame": 0.3, "late_frame_s": 12.0},
+        {"repeat_frame": 0.5, "late_frame_s": 12.0},
         {"wrong_camera": 0.15},
         {"wrong_exposure": 0.15},
         {"drift_ppm": 200.0},
@@ -115,9 +117,9 @@ def test_kept_frames_show_the_pop_they_name(world, session, faults):
     done = capture(simulated, session)
     assert done.steps == 14
     check(simulated, session)
-    if set(faults) & {"misfire", "drop_frame", "wrong_camera", "wrong_exposure"}:
+    if set(faults) & {"misfire", "drop_frame", "late_frame", "wrong_camera", "wrong_exposure"}:
         assert done.retakes > 0
-    assert (done.stale > 0) == ("stale" in faults)
+    assert (done.stale > 0) == bool(set(faults) & {"stale", "late_frame", "repeat_frame"})
 
 
 @pytest.mark.parametrize(

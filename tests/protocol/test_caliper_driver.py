@@ -150,6 +150,12 @@ def test_reached_limit_returns_jaws_and_bars_direction(bench):
     assert box.move_to(3).ended == "reached"
 
 
+def test_listening_for_no_time_asks_nothing(bench):
+    asked = bench.box.port.statistics.requests
+    bench.box.listen(0.0)
+    assert bench.box.port.statistics.requests == asked
+
+
 def test_listening_keeps_skin_held_and_silence_releases(bench):
     box = bench.box
     box.set_lease(0.3)

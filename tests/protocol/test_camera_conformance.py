@@ -200,6 +200,31 @@ def test_a_stale_frame_is_noticed_by_its_time(faulty):
     assert second.t_start_s > first.t_end_s
 
 
+def test_late_frame_is_refused_after_next_trigger(faulty):
+    """It was exposed before the trigger, although its number is the requested one."""
+    camera = faulty(late_frame=1.0, late_frame_s=2.0)
+    with pytest.raises(FrameTimeout):
+        next_frame(camera, seq=0, not_before_s=shoot(camera), want=WANT, timeout_s=0.01)
+    camera.world.clock.sleep(3.0)
+    before = shoot(camera)
+    frame, dropped = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=5.0)
+    assert dropped == 1
+    assert frame.t_start_s >= before
+
+
+def test_frame_that_comes_twice_is_taken_once(faulty):
+    camera = faulty(repeat_frame=1.0, late_frame_s=0.5)
+    kept = []
+    for number in range(5):
+        before = shoot(camera)
+        frame, dropped = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=1.0)
+        assert dropped == (number > 0)
+        assert frame.t_start_s >= before
+        kept.append(frame.t_start_s)
+        camera.world.clock.sleep(1.0)
+    assert len(set(kept)) == 5
+
+
 def test_a_lost_frame_is_a_timeout(faulty):
     camera = faulty(drop_frame=1.0)
     with pytest.raises(FrameTimeout):
@@ -230,7 +255,8 @@ def test_clock_drift_still_detects_stale_accepts_good_frames(faulty, drift_ppm):
 
 
 def test_two_hundred_exposures_accept_only_good_frames(faulty):
-    camera = faulty(stale=0.3, drop_frame=0.2, wrong_camera=0.2, wrong_exposure=0.2)
+    late = {"late_frame": 0.2, "repeat_frame": 0.2, "late_frame_s": 3.0}
+    camera = faulty(stale=0.3, drop_frame=0.2, wrong_camera=0.2, wrong_exposure=0.2, **late)
     accepted = refused = 0
     for _ in range(200):
         before = shoot(camera)

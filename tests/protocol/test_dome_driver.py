@@ -77,9 +77,14 @@ def test_armed_table_runs_once_with_every_release_timed(bench):
     assert [pulse.led for pulse in bench.world.switched] == UNSEEN[:8]
 
 
-def test_long_table_loads_in_short_lines_with_checksum(bench):
-    many = [TableRow(tuple(UNSEEN[:5]), 0.1, 0.05, 3)] * 60
+def test_long_table_loads_in_short_lines_with_checksum(bench, monkeypatch):
+    many, parts = [TableRow(tuple(UNSEEN[:5]), 0.1, 0.05, 3)] * 60, []
+    port = bench.box.port
+    ask = port.ask
+    monkeypatch.setattr(port, "ask", lambda line, **more: parts.append(line) or ask(line, **more))
     bench.box.load(many)
+    lengths = [len(line.partition(",")[2]) for line in parts if line.startswith("SEQ:DEF")]
+    assert 100 < max(lengths) <= 200  # bytes that a controller stores per line
     assert len(bench.world.box("dome").device.table) == 60
     bench.box.load(many[:2])
     assert len(bench.world.box("dome").device.table) == 2

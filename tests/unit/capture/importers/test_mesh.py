@@ -119,6 +119,14 @@ BROKEN = {
 }
 
 
+def test_obj_names_of_any_encoding_are_read(tmp_path):
+    text = CORNERS + "f 1 2 3\n"
+    for number, name in enumerate((b"\xe4", "\u00e4".encode(), b"\xff\xfe\x00")):
+        path = tmp_path / f"{number}.obj"
+        path.write_bytes(b"o " + name + b"\n" + text.encode())
+        assert len(read_mesh(path).faces) == 1
+
+
 @pytest.mark.parametrize("name", BROKEN)
 def test_unusable_mesh_gives_single_clear_error(tmp_path, name):
     content, says = BROKEN[name]

@@ -307,6 +307,16 @@ def damage(path, at, value=0xA5):
     path.write_bytes(bytes(data))
 
 
+def tiny_rows_per_strip(path):
+    """Write a TIFF whose strips have 5e-324 rows each: infinitely many, as a double."""
+    tifffile.imwrite(path, np.zeros((9, 8, 3), np.uint16), photometric="rgb")
+    data = path.read_bytes()
+    tag, long, double = 278, 4, 12
+    entry = data.index(struct.pack("<HHI", tag, long, 1))
+    changed = struct.pack("<HHII", tag, double, 1, len(data))
+    path.write_bytes(data[:entry] + changed + data[entry + 12 :] + struct.pack("<d", 5e-324))
+
+
 def bad_file(kind, folder, picture):
     png = save_png(folder / "x.png", picture)
     jpeg = folder / "x.jpg"
@@ -343,6 +353,8 @@ def bad_file(kind, folder, picture):
         )
     elif kind == "tif 32 bit":
         tifffile.imwrite(folder / "x.tif", np.zeros((9, 8, 3), np.uint32), photometric="rgb")
+    elif kind == "tif rows of 5e-324":
+        tiny_rows_per_strip(folder / "x.tif")
     elif kind == "exr cut":
         OpenEXR.File({}, {"RGB": np.ones((40, 40, 3), np.float32)}).write(str(folder / "x.exr"))
         data = (folder / "x.exr").read_bytes()
@@ -375,6 +387,7 @@ def bad_file(kind, folder, picture):
         "tif garbage",
         "tif 5 channels",
         "tif 32 bit",
+        "tif rows of 5e-324",
         "exr cut",
         "exr of depth only",
         "exr black",

@@ -52,6 +52,13 @@ def test_strongest_light_has_largest_energy():
     assert dose_report(plan, dark).eye_j_m2 < dose_report(plan, DOME).eye_j_m2
 
 
+def test_lights_without_power_have_no_led_dose():
+    """Flash tubes have an energy per pop, not a power."""
+    tubes = [dataclasses.replace(one, power_w=None, energy_ws=1.0) for one in DOME.lights]
+    rig = dataclasses.replace(DOME, lights=tuple(tubes))
+    assert dose_report(dome_plan(DOME, tracking_interval=0), rig).led_ws == 0.0
+
+
 def test_narrow_light_has_radiance_of_its_area():
     plan = dome_plan(DOME, tracking_interval=0)
     small = change_light(DOME, 7, radius_mm=DOME.lights[7].radius_mm / 3.0)

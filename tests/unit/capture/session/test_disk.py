@@ -39,6 +39,13 @@ def test_files_and_folders_are_synchronized_by_named_call(tmp_path, synced):
     assert synced == [("fsync", file), ("fdatasync", file), ("fsync", folder)]
 
 
+def test_synchronized_folder_is_closed_again(tmp_path, synced):
+    """A session of many frames would end with too many open files."""
+    before = sorted(os.listdir("/proc/self/fd"))
+    Disk().fsync_dir(tmp_path)
+    assert sorted(os.listdir("/proc/self/fd")) == before
+
+
 def test_raw_file_is_on_disk_before_naming(tmp_path, synced):
     raw.write_dng(
         tmp_path / "a.dng",

@@ -2,8 +2,16 @@
 
 import pytest
 
-from capture.session.errors import SessionDamage
-from capture.session.journal import CloseLine, OmissionLine, seal_line, walk_journal
+from capture.session.errors import SessionDamage, SessionError
+from capture.session.journal import (
+    MAX_LINE_BYTES,
+    CloseLine,
+    FrameLine,
+    OmissionLine,
+    seal_bounded_line,
+    seal_line,
+    walk_journal,
+)
 
 SEAL = "0" * 64
 OMITTED = OmissionLine(steps=("S001",), reason="blinked", about={}, t_host_s=1.0)
@@ -23,6 +31,28 @@ def test_omission_line_needs_different_names(steps):
         OmissionLine(steps=steps, reason="blinked", about={}, t_host_s=1.0)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("step", "../S001"),
+        ("camera", "../cam"),
+        ("attempt", 0),
+        ("file", "frames/S002+cam.dng"),
+        ("bytes", 0),
+        ("xxh128", "0" * 31),
+    ],
+)
+def test_frame_line_refuses_impossible_values(field, value):
+    good = {
+        **{"step": "S001", "camera": "cam", "attempt": 1, "file": "frames/S001+cam.dng"},
+        **{"bytes": 1, "xxh128": "0" * 32, "settings": {}, "actual": {}},
+        **{"t_box_s": None, "t_host_s": 1.0},
+    }
+    FrameLine(**good)
+    with pytest.raises(SessionDamage, match=rf"\n  {field}: got "):
+        FrameLine(**good | {field: value})
+
+
 def test_data_after_end_is_damage():
     texts = seal_lines(OMITTED, CloseLine(frames=0, missing=(), reason=""))
     assert walk_journal(b"".join(texts), seal=SEAL, where="journal").damage is None
@@ -30,6 +60,24 @@ def test_data_after_end_is_damage():
     assert "data after the end" in str(walk.damage)
     assert len(walk.lines) == 2
     assert walk.end == sum(map(len, texts))
+
+
+@pytest.mark.parametrize("excess", [0, 1])
+def test_longest_line_is_written_and_read(excess):
+    """An acknowledged line is readable: the writer's limit is the reader's."""
+    (empty,) = seal_lines(OmissionLine(steps=("S001",), reason=".", about={}, t_host_s=1.0))
+    reason = "." * (1 + MAX_LINE_BYTES + excess - len(empty))
+    line = OmissionLine(steps=("S001",), reason=reason, about={}, t_host_s=1.0)
+    (text,) = seal_lines(line)
+    assert len(text) == MAX_LINE_BYTES + excess
+    walk = walk_journal(text, seal=SEAL, where="journal")
+    if excess:
+        assert "65537 bytes" in str(walk.damage)
+        with pytest.raises(SessionError, match="too long"):
+            seal_bounded_line(SEAL, line)
+    else:
+        assert walk.lines == ((0, line),)
+        assert seal_bounded_line(SEAL, line)[0] == text
 
 
 @pytest.mark.parametrize(("zeros", "torn"), [(1, False), (2, True), (3, True)])

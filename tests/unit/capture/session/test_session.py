@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import threading
 from datetime import UTC, date, datetime
 
 import numpy as np
@@ -22,6 +23,7 @@ from capture.session import (
     SessionLocked,
     SubjectRecord,
     reopen_copy,
+    verification,
     verify,
 )
 
@@ -221,8 +223,8 @@ def test_orphans_of_same_name_do_not_overwrite(session):
         ({"step_id": "S999"}, PlanError, "no step"),
         ({"step_id": "../../x"}, PlanError, "no step"),
         ({"camera": "left"}, SessionError, "no such camera"),
-        ({"attempt": 0}, SessionError, "attempt"),
-        ({"settings": {"power": float("nan")}}, SessionError, "cannot be written"),
+        ({"attempt": 0}, SessionError, "attempt: got 0, expected 1"),
+        ({"settings": {"power": float("nan")}}, SessionError, r"cannot be written\n  settings"),
         ({"actual": {"note": "x" * 70_000}}, SessionError, "too long"),
         ({"blob": b"not a frame"}, raw.RawError, "not a raw file"),
         ({"blob": b""}, raw.RawError, "is not a raw file|is empty"),
@@ -257,15 +259,20 @@ def test_a_committed_frame_is_not_committed_twice(session):
         commit(session, "D000")
 
 
-@pytest.mark.parametrize("content", ["file", "folder"])
-def test_session_never_starts_over_existing_content(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [("file", "got a file"), ("link", "got a link"), ("folder", r"got a folder with notes\.txt")],
+)
+def test_session_never_starts_over_existing_content(tmp_path, content, reason):
     path = tmp_path / "s"
     if content == "file":
         path.write_text("notes")
+    elif content == "link":
+        path.symlink_to(tmp_path / "elsewhere")
     else:
         path.mkdir()
         (path / "notes.txt").write_text("notes")
-    with pytest.raises(SessionError, match="cannot start here"):
+    with pytest.raises(SessionError, match=f"cannot start here\n  folder: {reason}"):
         create(path)
     with pytest.raises(SessionError, match="no such folder"):
         create(tmp_path / "nowhere" / "s")
@@ -366,6 +373,30 @@ def test_verify_counts_frames_and_bytes(closed):
     report = verify(closed, today=NOON.date())
     sizes = [file.stat().st_size for file in (closed / "frames").iterdir()]
     assert (report.frames, report.bytes) == (len(sizes), sum(sizes))
+    (closed / "session.json").write_bytes(b"{}")
+    damaged = verify(closed, today=NOON.date())
+    assert (damaged.ok, damaged.frames, damaged.bytes) == (False, 0, 0)
+
+
+def test_interrupted_verification_leaves_other_files(session, monkeypatch):
+    """Ctrl-C does not wait until a large session has been read."""
+    for number in range(40):
+        session.attach(f"{number}.txt", b"x")
+    checked, stopped = [], threading.Event()
+
+    def check_file(path, line):
+        checked.append(line.name)
+        if len(checked) > 1:
+            stopped.wait(10.0)
+
+    def stop(line):
+        stopped.set()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(verification, "check_file", check_file)
+    with pytest.raises(KeyboardInterrupt):
+        verify(session.path, progress=stop)
+    assert len(checked) < 20
 
 
 # --- the disk -------------------------------------------------------------------------------------
@@ -464,7 +495,7 @@ def test_attachment_survives_interruption_strays_become_orphans(session):
         ("scan.part", b"x", {}, "name"),
         ("", b"x", {}, "name"),
         ("scan.ply", b"", {}, "0 bytes"),
-        ("scan.ply", b"x", {"scale": float("nan")}, "cannot be written"),
+        ("scan.ply", b"x", {"scale": float("nan")}, r"cannot be written\n  about"),
         ("there.ply", b"y", {}, "there already"),
     ],
 )
@@ -518,6 +549,14 @@ def test_copy_of_closed_session_takes_attachment_original_unchanged(tmp_path, se
     assert verify(tmp_path / "copy").ok
     records = [opened.read(opened.frames()[0]).cfa for opened in both]
     np.testing.assert_array_equal(*records)
+
+
+def test_interrupted_copy_of_closed_session_starts_again(tmp_path, closed):
+    (tmp_path / "copy/frames").mkdir(parents=True)
+    (tmp_path / "copy/journal.jsonl").touch()
+    copy, reason = reopen_copy(closed, tmp_path / "copy")
+    copy.close(missing_reason=reason)
+    assert verify(tmp_path / "copy").ok
 
 
 def test_only_a_closed_and_sound_session_is_copied(tmp_path, session):

@@ -470,6 +470,8 @@ def test_lost_controller_ends_dark_released_keeps_captured_frames(make):
         {"wrong_camera": 0.15},
         {"wrong_exposure": 0.15},
         {"stale": 1.0},
+        {"late_frame": 0.15, "late_frame_s": 12.0},
+        {"repeat_frame": 0.5, "late_frame_s": 12.0},
         {"drift_ppm": 150.0},
         {"drop": 5e-4, "flip": 5e-4, "lose_answer": 0.03, "cut": 0.01},
     ],
@@ -480,9 +482,9 @@ def test_kept_frames_are_correct_under_any_fault(make, faults):
     done = bench.run()
     assert bench.session.pending_frames() == []
     check_frames(bench.session)
-    spoilt = {"drop_frame", "wrong_camera", "wrong_exposure"} & set(faults)
+    spoilt = {"drop_frame", "late_frame", "wrong_camera", "wrong_exposure"} & set(faults)
     assert (done.retakes > 0) == bool(spoilt)
-    if "stale" in faults:
+    if {"stale", "repeat_frame"} & set(faults):
         assert done.stale > 0
 
 

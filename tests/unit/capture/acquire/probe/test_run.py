@@ -426,7 +426,16 @@ def test_camera_still_warm_is_waited_for(make):
 # camera and shutter ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("faults", [{"stale": 0.3}, {"drop_frame": 0.15}])
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"stale": 0.3},
+        {"drop_frame": 0.15},
+        {"late_frame": 0.2, "late_frame_s": 12.0},
+        {"repeat_frame": 0.5, "late_frame_s": 12.0},
+    ],
+    ids=lambda faults: next(iter(faults)),
+)
 def test_occasional_frame_failures_leave_sound_session(make, faults):
     bench = make(short(brackets=8), **faults)
     done = bench.run(all_brackets=True)
