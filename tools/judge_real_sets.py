@@ -49,8 +49,8 @@ from skinrig.importing.light_stacks import find_lights
 
 Array = NDArray[Any]
 
-NOISELESS_COSINE = 0.002
-"""Least cosine between normal and ray for normals of a scan, which have no noise."""
+FORMER_COSINE = 0.02
+"""Former default of the least cosine between normal and ray."""
 DEPTH_ERRORS_MM = {
     "bear": (1.202, 0.334),
     "buddha": (3.719, 1.098),
@@ -185,8 +185,8 @@ def judge_normal_maps(
             sets / "diligent-normals/data/Fig7_diligent" / name
         )
         plain, jumps = DEPTH_ERRORS_MM[name]
-        for least in (IntegrationSettings().min_ray_cosine, NOISELESS_COSINE):
-            exact = least == NOISELESS_COSINE
+        for least in (FORMER_COSINE, IntegrationSettings().min_ray_cosine):
+            exact = least != FORMER_COSINE
             smooth = integrate_map(
                 normals,
                 valid=mask,
@@ -207,8 +207,8 @@ def judge_normal_maps(
 def judge_noise(sets: Path, names: Sequence[str] = tuple(DEPTH_ERRORS_MM)) -> Iterator[Figure]:
     """Yield mean depth errors of least squares over objects, from normals with noise."""
     for noise_deg in NOISE_DEG:
-        errors: dict[float, list[float]] = {IntegrationSettings().min_ray_cosine: []}
-        errors[NOISELESS_COSINE] = []
+        errors: dict[float, list[float]] = {FORMER_COSINE: []}
+        errors[IntegrationSettings().min_ray_cosine] = []
         for seed, name in enumerate(names):
             normals, mask, camera, truth = load_normal_map(
                 sets / "diligent-normals/data/Fig7_diligent" / name

@@ -46,8 +46,8 @@ class IntegrationSettings:
     order : int
         Order of the quadrature between pixels: 4, or 2 for the mean of two neighbors.
     min_ray_cosine : float
-        Least cosine between normal and ray of a usable pixel, in (0, 1). Steps of depth lie in the
-        pixels below it: 0.002 keeps most steps, but accepts slopes of up to 500.
+        Least cosine between normal and ray of a usable pixel, in (0, 1). Steps of depth lie in
+        grazing pixels: 0.002 keeps most of them, with slopes of up to 500.
     """
 
     tolerance: float = 1e-5
