@@ -1,5 +1,6 @@
 """Import scanned meshes into SESSION/: OBJ and PLY, checked, in millimeters."""
 
+import codecs
 import hashlib
 import io
 import re
@@ -214,7 +215,8 @@ def _decode(data: bytes, kind: str, source: Path) -> _Arrays:
         # a stream and not a path: files named inside (materials, textures) are not opened
         stream: io.BytesIO | io.StringIO = io.BytesIO(data)
         if kind == "obj":  # names and comments of unknown encoding: the library would guess it
-            stream = io.StringIO(data.decode("utf-8-sig", "replace"))
+            wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+            stream = io.StringIO(data.decode("utf-16" if wide else "utf-8-sig", "replace"))
         loaded: Any = trimesh.load_scene(stream, file_type=kind, process=False)
         parts = [part for part in loaded.dump() if hasattr(part, "faces")]
     except Exception as exc:  # the readers raise whatever their parsers raise

@@ -125,6 +125,8 @@ def test_obj_names_of_any_encoding_are_read(tmp_path):
         path = tmp_path / f"{number}.obj"
         path.write_bytes(b"o " + name + b"\n" + text.encode())
         assert len(read_mesh(path).faces) == 1
+    path.write_text(text, encoding="utf-16")
+    assert len(read_mesh(path).faces) == 1
 
 
 @pytest.mark.parametrize("name", BROKEN)
