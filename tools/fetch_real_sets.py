@@ -67,8 +67,18 @@ def read_sets(table: Path = TABLE) -> tuple[RealSet, ...]:
     Raises
     ------
     FetchError
-        For names, commits, paths or digests of another form, and for sets without files.
+        For tables that cannot be read, for names, commits, paths or digests of another form, and
+        for sets without files.
     """
+    try:
+        return _parse_sets(table)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise FetchError(
+            f"{table}: is no table of sets: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _parse_sets(table: Path) -> tuple[RealSet, ...]:
     rows: dict[str, list[PinnedFile]] = {}
     with table.with_suffix(".csv").open(encoding="utf-8", newline="") as stream:
         for row in csv.DictReader(stream):

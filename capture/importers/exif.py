@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ _TIFFFILE_NAMES = {
     _ISO_TAG: "ISOSpeedRatings",
     _FLASH_TAG: "Flash",
 }
+EXPOSURE_TERMS = {"exposure_s": "time", "iso": "ISO", "f_number": "f-number"}
+"""Settings that the exposure depends on, and what they are called."""
 MAX_ISO, MAX_F_NUMBER, MAX_EXPOSURE_S = 10_000_000, 1000.0, 86_400.0
 
 
@@ -71,23 +74,25 @@ def _parse(tags: Mapping[int, Any], orientation: object) -> ExifData:
     return ExifData(
         tags.get(_COLOR_SPACE_TAG) == _UNCALIBRATED,
         known_orientation(orientation),
-        _parse_number(tags.get(_EXPOSURE_TAG), MAX_EXPOSURE_S) or None,
+        _parse_number(tags.get(_EXPOSURE_TAG), MAX_EXPOSURE_S, fraction=True) or None,
         round(iso) if iso else None,
-        _parse_number(tags.get(_APERTURE_TAG), MAX_F_NUMBER) or None,
+        _parse_number(tags.get(_APERTURE_TAG), MAX_F_NUMBER, fraction=True) or None,
         None if flash is None else bool(int(flash) & 1),
     )
 
 
-def _parse_number(value: Any, largest: float) -> float | None:
+def _parse_number(value: Any, largest: float, *, fraction: bool = False) -> float | None:
     """Return a number, a fraction or the first of several; None if it is out of range.
 
     Examples
     --------
-    >>> _parse_number((1, 50), 10.0), _parse_number(8, 10.0), _parse_number((1, 0), 10.0)
-    (0.02, 8.0, None)
+    >>> _parse_number((1, 50), 10.0, fraction=True), _parse_number((200, 200), 1000.0)
+    (0.02, 200.0)
+    >>> _parse_number((1, 0), 10.0, fraction=True) is None
+    True
     """
     try:
-        if isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, int) for v in value):
+        if fraction and isinstance(value, tuple) and len(value) == 2:
             value = value[0] / value[1]
         elif isinstance(value, tuple):
             value = value[0]
@@ -102,30 +107,40 @@ def known_orientation(value: object) -> int:
     return value if isinstance(value, int) and 1 <= value <= N_ORIENTATIONS else 1
 
 
-def compute_exposure(settings: Mapping[str, Any]) -> float | None:
-    """Return the exposure that settings state, in seconds at ISO 100 and f/1, or None.
+def compare_exposures(images: Sequence[Mapping[str, Any]]) -> tuple[list[float], str]:
+    """Return the exposures of several images in a common unit, and the terms that they consist of.
 
-    A flash is shorter than the exposure: its time does not count where ``flash`` is "fired". ISO
-    and f-number count as 100 and 1 if they are not stated.
+    A flash is shorter than the exposure: its time does not count where ``flash`` is "fired".
 
     Parameters
     ----------
-    settings
-        With ``exposure_s``, ``iso``, ``f_number`` and ``flash``, each optional.
+    images
+        Settings of each, with ``exposure_s``, ``iso``, ``f_number`` and ``flash``, each optional.
+
+    Returns
+    -------
+    list of float
+        Products of time, ISO and 1 / f-number^2, as far as stated; empty where the images do not
+        state the same terms, where a flash fired for some only, and without images.
+    str
+        "time, ISO and f-number", or those of them that are stated; empty with the list.
 
     Examples
     --------
-    >>> compute_exposure({"exposure_s": 0.02, "iso": 200, "f_number": 2.0})
-    0.01
-    >>> compute_exposure({"exposure_s": 0.02, "iso": 200, "f_number": 2.0, "flash": "fired"})
-    0.5
-    >>> compute_exposure({"iso": 200}) is None
-    True
+    >>> compare_exposures([{"exposure_s": 0.5, "iso": 100}, {"exposure_s": 0.25, "iso": 100}])
+    ([50.0, 25.0], 'time and ISO')
+    >>> flash = {"exposure_s": 0.5, "f_number": 2.0, "flash": "fired"}
+    >>> compare_exposures([flash, {**flash, "f_number": 4.0}])
+    ([0.25, 0.0625], 'f-number')
+    >>> compare_exposures([flash, {**flash, "flash": "off"}])
+    ([], '')
     """
-    fired = settings.get("flash") == "fired"
-    if not fired and "exposure_s" not in settings:
-        return None
-    time = 1.0 if fired else float(settings["exposure_s"])
-    iso, f_number = float(settings.get("iso", 100.0)), float(settings.get("f_number", 1.0))
-    exposure = time * iso / 100.0 / f_number**2
-    return exposure if exposure > 0.0 else None
+    fired = {one.get("flash") == "fired" for one in images}
+    names = [name for name in EXPOSURE_TERMS if name != "exposure_s" or fired == {False}]
+    stated = {tuple(name for name in names if float(one.get(name, 0.0)) > 0.0) for one in images}
+    if len(fired) != 1 or len(stated) != 1 or not (terms := stated.pop()):
+        return [], ""
+    power = {"f_number": -2}
+    found = [math.prod(float(one[k]) ** power.get(k, 1) for k in terms) for one in images]
+    said = [EXPOSURE_TERMS[name] for name in terms]
+    return found, " and ".join([", ".join(said[:-1]), said[-1]] if said[1:] else said)

@@ -68,7 +68,7 @@ class Photo:
 
     @property
     def exposure_settings(self) -> dict[str, str | int | float]:
-        """Stated settings of the exposure, by the names that `compute_exposure` reads."""
+        """Stated settings of the exposure, by the names that `compare_exposures` reads."""
         frame = self.frame
         stated = {"exposure_s": frame.exposure_s, "iso": frame.iso, "f_number": frame.f_number}
         settings: dict[str, str | int | float] = {k: v for k, v in stated.items() if v is not None}

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from capture.importers.exif import compute_exposure
+from capture.importers.exif import compare_exposures
 
 MAX_EQUAL_DEVIATION = 0.005
 """Relative difference of two exposures that count as equal: EXIF data round times."""
-EXPOSURE_NAMES = ("exposure_s", "iso", "f_number", "flash")
 
 
 def relate_exposures(
@@ -20,7 +19,7 @@ def relate_exposures(
     Parameters
     ----------
     parallel, crossed
-        Settings that files state, see `compute_exposure`; empty for none.
+        Settings that files state, see `compare_exposures`; empty for none.
     names
         Of the two files, parallel first.
 
@@ -40,17 +39,16 @@ def relate_exposures(
     (1.0, 'p.png and c.png state no exposure that can be compared: both count as exposed alike')
     """
     both = " and ".join(names)
-    given = [{name for name in EXPOSURE_NAMES if name in one} for one in (parallel, crossed)]
-    exposures = compute_exposure(parallel), compute_exposure(crossed)
-    if parallel.get("flash") != crossed.get("flash") and all(given):
+    flashes = [one.get("flash") for one in (parallel, crossed)]
+    if flashes.count("fired") == 1:
         return 1.0, f"a flash fired for one of {both} only: both count as exposed alike"
-    if given[0] != given[1] or exposures[0] is None or exposures[1] is None:
+    exposures, terms = compare_exposures([parallel, crossed])
+    if not exposures:
         unknown = "state no exposure that can be compared: both count as exposed alike"
         return 1.0, f"{both} {unknown}"
     ratio = exposures[0] / exposures[1]
     if abs(ratio - 1.0) < MAX_EQUAL_DEVIATION:
         return 1.0, ""
-    terms = "ISO and f-number" if parallel.get("flash") == "fired" else "time, ISO and f-number"
     return ratio, (
         f"{names[0]} has {ratio:.3g} times the exposure of {names[1]} by its {terms}: its light is "
         "divided by that"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.importers.exif import compute_exposure
+from capture.importers.exif import EXPOSURE_TERMS, compare_exposures
 from capture.session import Session
 from capture.session.view import FrameRecord
 from model.checks import Checks
@@ -82,22 +82,24 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     stage = inputs.stage_maker(STAGE_REVISION)
     known = "stack lights normals gray_albedo"
     return [
-        stage("stack", "", "stack", partial(_stack, inputs.session)),
+        stage("stack", "", "stack", partial(_stack, inputs.session, inputs.assumed)),
         stage("lights", "stack", "lights", partial(_lights, inputs)),
         stage("normals", "stack lights", "normals residual gray_albedo", partial(_normals, inputs)),
         stage("albedo", known, "albedo", partial(_albedo, inputs.session)),
     ]
 
 
-def _stack(session: Session) -> LightStack:
+def _stack(session: Session, assumed: list[str]) -> LightStack:
     records = tuple(session.frames("olat"))
     got = f"{len(records)} frames under one light at a time"
     Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3; add images")
-    stated = [compute_exposure(record.settings) for record in records]
-    exposures = [one for one in stated if one is not None]
+    settings = [record.settings for record in records]
+    exposures, _ = compare_exposures(settings)
     gain = np.ones((len(records), 3))
-    if len(exposures) == len(records):
+    if exposures:
         gain *= (np.median(exposures) / np.array(exposures))[:, None]
+    elif any(name in one for one in settings for name in EXPOSURE_TERMS):
+        assumed.append("exposures of the images cannot be compared: all count as exposed alike")
     listed = session.manifest.extra.get("light_list")
     strength = listed.get("intensity") if isinstance(listed, dict) else None
     if strength is not None:
@@ -187,11 +189,14 @@ def diagnose_images(session: Session) -> DiagnosedImages:
     PhotometricStereoError
         If its images cannot be judged: too few, or without light.
     """
-    stack = _stack(session)
+    assumed: list[str] = []
+    stack = _stack(session, assumed)
     vectors, near, _ = _listed_lights(session, stack)
     found = _diagnose(stack, vectors, near=near)
     names = tuple(str(number + 1) for number in range(len(stack.gray)))
-    return DiagnosedImages(found.findings, names, stack.gray, found, unit_vectors(vectors))
+    return DiagnosedImages(
+        found.findings, names, stack.gray, found, unit_vectors(vectors), tuple(assumed)
+    )
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:

@@ -178,12 +178,15 @@ def _interpolation(
     height, width = usable.shape
     row, column = np.divmod(nearest, width)
     away = place_mm - true_mm[row, column]
-    ways, inside = [], np.ones(len(nearest), np.bool_)
+    ways, lengths, inside = [], [], np.ones(len(nearest), np.bool_)
     for i, j, here, size in ((1, 0, row, height), (0, 1, column, width)):
         there = (here > 0) & (here < size - 1)
-        inside &= there
-        ahead = true_mm[row + i * there, column + j * there]
-        ways.append(0.5 * (ahead - true_mm[row - i * there, column - j * there]))
+        ahead = row + i * there, column + j * there
+        behind = row - i * there, column - j * there
+        inside &= there & usable[ahead] & usable[behind]
+        ways.append(0.5 * (true_mm[ahead] - true_mm[behind]))
+        for side in (ahead, behind):
+            lengths.append(np.linalg.norm(true_mm[side] - true_mm[row, column], axis=-1))
     slopes = np.stack(ways, axis=1)
     gram = np.einsum("nak,nbk->nab", slopes, slopes) + 1e-9 * np.eye(2)
     along = np.linalg.solve(gram, np.einsum("nak,nk->na", slopes, away)[..., None])[..., 0]
@@ -192,11 +195,15 @@ def _interpolation(
     rows = np.stack([row, row + steps[0], row, row + steps[0]], axis=1)
     columns = np.stack([column, column, column + steps[1], column + steps[1]], axis=1)
     weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
-    apart = np.linalg.norm(true_mm[rows, columns] - true_mm[row, column][:, None], axis=-1)
-    together = (apart < MAX_TEXEL_STRETCH * np.median(apart[:, 1:3])).all(axis=1)
-    good = inside & usable[rows, columns].all(axis=1) & together
-    alone = np.array([1.0, 0.0, 0.0, 0.0])
-    return rows * width + columns, np.where(good[:, None], weights, alone)
+    lengths.append(
+        np.linalg.norm(true_mm[rows[:, 3], columns[:, 3]] - true_mm[row, column], axis=-1)
+    )
+    apart = np.array(lengths)
+    together = (apart < MAX_TEXEL_STRETCH * np.median(apart)).all(axis=0)
+    good = (inside & usable[rows, columns].all(axis=1) & together)[:, None]
+    # values of texels that are not usable are undefined: they must not be read at all
+    corners = np.where(good, rows * width + columns, nearest[:, None])
+    return corners, np.where(good, weights, np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def compare(

@@ -10,6 +10,7 @@ import numpy as np
 
 from capture.documents import Fault, InputError
 from capture.importers.camera_poses import read_camera_axes
+from capture.importers.exif import compare_exposures
 from capture.importers.image_stacks import LINEAR_MISFIT_RATIO, Encoding, encode_srgb
 from capture.importers.images import read_photo
 from capture.importers.imported_session import find_common_white
@@ -274,7 +275,7 @@ def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) 
     images: list[Float64Array] = []
     usable: list[BoolArray] = []
     whites: list[float | None] = []
-    exposures: list[float] = []
+    settings: list[dict[str, str | int | float]] = []
     whole = np.zeros((0, 0), bool)
     inside = whole
     for file in files:
@@ -298,7 +299,7 @@ def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) 
         images.append(reduced.gray[0])
         usable.append(reduced.usable[0])
         whites.append(photo.white_value)
-        exposures.append((frame.exposure_s or 0.0) * (frame.iso or 100.0))
+        settings.append(photo.exposure_settings)
         inside = reduced.inside
     if not inside.any():
         raise LightListError.at(
@@ -313,6 +314,7 @@ def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) 
     if white_value:
         factors = [1.0 if white is None else white / white_value for white in whites]
         found *= np.array(factors)[:, None, None]
-    if all(exposure > 0.0 for exposure in exposures):
+    exposures, _ = compare_exposures(settings)
+    if exposures:
         found *= (np.median(exposures) / np.array(exposures))[:, None, None]
     return ReducedStack(found, np.array(usable), inside)

@@ -48,7 +48,7 @@ from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 _log = logging.getLogger(__name__)
 
-STAGE_REVISION = 14
+STAGE_REVISION = 15
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")

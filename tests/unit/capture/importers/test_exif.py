@@ -8,11 +8,14 @@ from fixtures.faulty_patterns import make_pair
 from PIL import Image, TiffImagePlugin
 
 from capture.importers import import_photos, read_photo
-from capture.importers.exif import ExifData, compute_exposure, read_exif
+from capture.importers.exif import ExifData, _parse, compare_exposures, read_exif
 from capture.importers.pair_exposures import relate_exposures
 from capture.session import Session
 from reconstruction.pipeline.flash.mean_frames import make_image_reader
 from reconstruction.pipeline.flash.pair_diagnosis import diagnose_pairs
+from reconstruction.pipeline.light_stack import diagnose_images
+from skinrig.cli import main
+from skinrig.importing.light_stacks import _read_reduced as read_reduced
 
 FLASH_FIRED, FLASH_OFF = 1, 0
 
@@ -114,4 +117,50 @@ def test_time_does_not_count_where_flash_fired():
     assert ratio == pytest.approx(0.5)
     ratio, text = relate_exposures({**one, "flash": "off"}, other, ("p", "c"))
     assert (ratio, "one of p and c only" in text) == (1.0, True)
-    assert compute_exposure({"exposure_s": 0.01, "iso": 0}) is None
+    alone = {"exposure_s": 0.01, "flash": "fired"}
+    assert "no exposure that can be compared" in relate_exposures(alone, alone, ("p", "c"))[1]
+
+
+def test_exposures_of_different_terms_are_not_compared():
+    """A time with an f-number and one without differ by f^2, a flash and the sun by anything."""
+    bare, full = {"exposure_s": 0.01, "iso": 100}, {"exposure_s": 0.01, "iso": 100, "f_number": 8.0}
+    assert compare_exposures([bare, full]) == ([], "")
+    assert compare_exposures([full, {**full, "flash": "fired"}]) == ([], "")
+    assert compare_exposures([]) == ([], "")
+    # without a tag of the flash, and with one that did not fire
+    ratio, text = relate_exposures({**full, "exposure_s": 0.02, "flash": "off"}, full, ("p", "c"))
+    assert (ratio, "by its time, ISO and f-number" in text) == (2.0, True)
+    assert "by its time:" in relate_exposures({"exposure_s": 2}, {"exposure_s": 1}, ("p", "c"))[1]
+
+
+def test_several_values_of_iso_are_no_fraction():
+    assert _parse({0x8827: (200, 200), 0x829A: (1, 50)}, 1).iso == 200
+    assert _parse({0x8827: (200, 200), 0x829A: (1, 50)}, 1).exposure_s == 0.02
+
+
+def save_stack(folder, flashes):
+    """Save six images of one surface, taken at 1/60 and 1/200 s by turns."""
+    folder.mkdir()
+    image = np.tile(np.linspace(20, 200, 48, dtype=np.uint8), (48, 1))
+    for number, fired in enumerate(flashes):
+        exif = make_exif((1 / 60, 1 / 200)[number % 2], 100, 8.0, FLASH_FIRED if fired else None)
+        Image.fromarray(image).save(folder / f"{number}.png", exif=exif)
+    angles = np.radians(60.0 * np.arange(len(flashes)))
+    vectors = np.stack([np.cos(angles), np.sin(angles), np.ones(len(flashes))], axis=-1)
+    np.savetxt(folder / "light_directions.txt", vectors)
+    return folder
+
+
+@pytest.mark.parametrize("flashes", [[1] * 6, [0] * 6, [0, 1, 1, 1, 1, 1]])
+def test_light_stack_uses_exposures_that_can_be_compared(flashes, tmp_path):
+    """Times count without a flash only; a flash in some of the images compares none."""
+    folder = save_stack(tmp_path / "in", flashes)
+    out = tmp_path / "s"
+    assert main(["import", "olat", str(folder), "--out", str(out), "--subject", "none"]) == 0
+    seen = diagnose_images(Session.open(out))
+    ratio = np.median(seen.gray[1] / seen.gray[0])
+    assert ratio == pytest.approx(200 / 60 if not any(flashes) else 1.0, rel=1e-5)
+    assert any("cannot be compared" in text for text in seen.assumed) == (0 < sum(flashes) < 6)
+    files = sorted(folder.glob("*.png"))
+    estimated = read_reduced(files, None, "linear").gray
+    assert np.median(estimated[1] / estimated[0]) == pytest.approx(ratio, rel=1e-5)

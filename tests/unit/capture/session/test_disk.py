@@ -39,11 +39,19 @@ def test_files_and_folders_are_synchronized_by_named_call(tmp_path, synced):
     assert synced == [("fsync", file), ("fdatasync", file), ("fsync", folder)]
 
 
-def test_synchronized_folder_is_closed_again(tmp_path, synced):
+def test_synchronized_folder_is_closed_again(tmp_path, synced, monkeypatch):
     """A session of many frames would end with too many open files."""
-    before = sorted(os.listdir("/proc/self/fd"))
+    opened, open_file = [], os.open
+
+    def open_noted(*args, **named):
+        opened.append(open_file(*args, **named))
+        return opened[-1]
+
+    monkeypatch.setattr(os, "open", open_noted)
     Disk().fsync_dir(tmp_path)
-    assert sorted(os.listdir("/proc/self/fd")) == before
+    (descriptor,) = opened
+    with pytest.raises(OSError, match="descriptor"):
+        os.fstat(descriptor)
 
 
 def test_raw_file_is_on_disk_before_naming(tmp_path, synced):

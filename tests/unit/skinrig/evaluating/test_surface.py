@@ -114,6 +114,8 @@ def test_nearest_texel_counts_alone_at_a_border(rng, broken):
     valid = np.ones((41, 41), bool)
     if broken == "masked":
         valid[:, 20:] = False
+        truth["position"][:, 20:], truth["r_d"] = 0.0, np.array(truth["r_d"])
+        truth["r_d"][:, 20:] = np.nan  # values that are not valid are undefined
     else:  # another chart begins here, 100 mm away
         truth["position"][:, 20:, 2] = 100.0
     units = {"position": "mm"}
@@ -126,3 +128,4 @@ def test_nearest_texel_counts_alone_at_a_border(rng, broken):
     assert used.max() == 19
     np.testing.assert_allclose(pairs.weights.sum(axis=1), 1.0, rtol=1e-12)
     assert pairs.interpolate(true.maps["position"])[:, 2].max() == 0.0
+    assert np.isfinite(pairs.interpolate(true.maps["r_d"])).all()
