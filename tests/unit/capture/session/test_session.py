@@ -424,7 +424,8 @@ class FullDisk(Disk):
 def test_failing_disk_costs_single_frame_not_acknowledged_ones(session, operation):
     commit(session, "D000")
     session.release()
-    writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
+    resumed = int(operation == "fdatasync")  # the journal is synchronized first
+    writer = Session.resume(session.path, disk=FullDisk(operation, after=resumed))
     with pytest.raises(SessionDiskError, match="No space left"):
         commit(writer, "S000")
     with pytest.raises(SessionError, match="not open for writing"):
@@ -522,7 +523,8 @@ def test_nothing_is_attached_to_a_closed_session(closed):
 def test_failing_disk_costs_attachment_only_keeps_acknowledged_data(session, operation):
     commit(session, "D000")
     session.release()
-    writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
+    resumed = int(operation == "fdatasync")  # the journal is synchronized first
+    writer = Session.resume(session.path, disk=FullDisk(operation, after=resumed))
     with pytest.raises(SessionDiskError, match="No space left"):
         writer.attach("scan.ply", b"scan")
     with Session.resume(session.path) as again:
