@@ -227,6 +227,8 @@ class _Sequences:
             poll_s=ROW_POLL_S,
             what=("sequence", "rows"),
         )
+        if table.lost_reports:  # one may have been that of a dead LED
+            box.find_failed_leds(led for number in table.times_s for led in rows[number].leds)
         missing = self._gather(steps, rows, table, attempt)
         return missing, table.end()
 

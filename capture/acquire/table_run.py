@@ -216,6 +216,8 @@ class TableRun:
     ----------
     times_s : dict of int to float
         Time at which each row released the cameras, on the controller's clock.
+    lost_reports : bool
+        Whether the line has lost events of the controller meanwhile.
     """
 
     def __init__(
@@ -236,8 +238,11 @@ class TableRun:
             name: arm_camera(camera, len(steps), box.ping) for name, camera in self._cameras.items()
         }
         keep_alive()
+        lost_before = box.lost_events
+        self.lost_reports = False
         began_s = box.trigger(token)
         self.times_s = self._listen(token, began_s, poll_s, keep_alive)
+        self.lost_reports |= box.lost_events > lost_before
         self._streams = {
             name: FrameStream(
                 name,
@@ -275,7 +280,7 @@ class TableRun:
             return {}
         for row in range(len(self._steps)):  # query the times whose reports were lost on the line
             if row not in times and (time_s := self._box.step_time(row)) is not None:
-                times[row] = time_s
+                times[row], self.lost_reports = time_s, True
         if position.state != "DONE":  # the light of its last row was cut short
             times.pop(position.row, None)
         return times

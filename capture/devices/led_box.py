@@ -5,7 +5,7 @@ table against its limits; the trigger starts it. The controller then steps on it
 each camera release. The lease runs meanwhile: `LedBox.listen` renews it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -86,11 +86,13 @@ class LedBox(EyeSafetyBox):
     Attributes
     ----------
     failed_leds : set of int
-        Numbers of the LEDs that the controller has reported as drawing no current.
+        Numbers of the LEDs that the controller has reported as drawing no current, or that have
+        emitted nothing in a table.
     """
 
     def __init__(self, port: Port, *, serial: str = "") -> None:
         self.failed_leds: set[int] = set()
+        self._emitting: set[int] = set()
         super().__init__(port, serial=serial)
 
     # sequence ---------------------------------------------------------------------------------
@@ -124,6 +126,11 @@ class LedBox(EyeSafetyBox):
         reports whether it runs, unless the controller has rebooted.
         """
         return self._token_time("TRIG", token)
+
+    @property
+    def lost_events(self) -> int:
+        """Number of the controller's events that the line has lost, as later ones show."""
+        return self._port.statistics.lost_events
 
     def position(self) -> SequencePosition:
         """Return the progress of the sequence."""
@@ -173,9 +180,24 @@ class LedBox(EyeSafetyBox):
         """Return the energy that an LED has emitted to this subject, Ws."""
         return self._number(f"DOSE? {led}")
 
+    def find_failed_leds(self, lit: Iterable[int]) -> None:
+        """Add LEDs that have emitted nothing to `failed_leds`.
+
+        The controller reports an LED that draws no current by an event, which a bad line can lose.
+        Its dose answers a request. Each LED is asked for once per subject at most.
+
+        Parameters
+        ----------
+        lit
+            Numbers of LEDs that a table has switched on.
+        """
+        for led in sorted(set(lit) - self._emitting - self.failed_leds):
+            (self._emitting if self.dose_ws(led) > 0.0 else self.failed_leds).add(led)
+
     def new_subject(self, pseudonym: str) -> None:
         """Restart the dose counter and clear the state of the eyes."""
         self._port.ask(f"DOSE:NEW {pseudonym}")
+        self._emitting.clear()
 
 
 def _parse_evaluation(payload: str) -> TableEvaluation:

@@ -212,9 +212,21 @@ def test_frame_counting_would_assign_frames_to_wrong_light(make, monkeypatch):
         run_and_check()
 
 
-def test_dead_light_is_reported_and_capture_continues(make):
+@pytest.mark.parametrize("heard", [True, False])
+def test_dead_light_is_reported_and_capture_continues(make, monkeypatch, heard):
+    """A bad line may lose the controller's event: the LED's dose shows that it emits nothing."""
     number = 9
     bench = make(led_dead=str(number), led_weak="4=0.5")
+    if not heard:
+        listen, statistics = bench.box.port.listen, bench.box.port.statistics
+
+        def lose_failures(seconds):
+            events = listen(seconds)
+            kept = [one for one in events if one.name != "LED:FAIL"]
+            statistics.lost_events += len(events) - len(kept)
+            return kept
+
+        monkeypatch.setattr(bench.box.port, "listen", lose_failures)
     done = bench.run()
     name = RIG.lights[number].name
     assert done.dead_lights == (name,)
