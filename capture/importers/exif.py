@@ -142,5 +142,5 @@ def compare_exposures(images: Sequence[Mapping[str, Any]]) -> tuple[list[float],
         return [], ""
     power = {"f_number": -2}
     found = [math.prod(float(one[k]) ** power.get(k, 1) for k in terms) for one in images]
-    said = [EXPOSURE_TERMS[name] for name in terms]
-    return found, " and ".join([", ".join(said[:-1]), said[-1]] if said[1:] else said)
+    words = [EXPOSURE_TERMS[name] for name in terms]
+    return found, " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)

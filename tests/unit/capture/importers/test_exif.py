@@ -133,7 +133,7 @@ def test_exposures_of_different_terms_are_not_compared():
     assert "by its time:" in relate_exposures({"exposure_s": 2}, {"exposure_s": 1}, ("p", "c"))[1]
 
 
-def test_several_values_of_iso_are_no_fraction():
+def test_two_iso_values_form_no_fraction():
     assert _parse({0x8827: (200, 200), 0x829A: (1, 50)}, 1).iso == 200
     assert _parse({0x8827: (200, 200), 0x829A: (1, 50)}, 1).exposure_s == 0.02
 
