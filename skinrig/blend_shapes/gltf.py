@@ -67,10 +67,11 @@ class _Gltf:
             raise self.build_error(f"not JSON: {error}") from error
         if not isinstance(document, dict):
             raise self.build_error("got no JSON object")
-        version = document.get("asset", {}).get("version", "none")
+        asset, required = document.get("asset"), document.get("extensionsRequired")
+        version = asset.get("version", "none") if isinstance(asset, dict) else "none"
         if not str(version).startswith("2."):
             raise self.build_error(f"got glTF version {version}, expected 2")
-        for name in document.get("extensionsRequired", []):
+        for name in required if isinstance(required, list) else []:
             if name in COMPRESSION_EXTENSIONS:
                 raise self.build_error(f"geometry is compressed by {name}; export it uncompressed")
         self.document: dict[str, Any] = document

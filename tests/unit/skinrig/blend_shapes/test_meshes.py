@@ -301,3 +301,13 @@ def test_shared_face_smile_stretches_and_compresses_skin():
     twins = np.diff(found.point_index[order]) == 0
     assert twins.sum() > 100
     np.testing.assert_array_equal(found.r_s[order][1:][twins], found.r_s[order][:-1][twins])
+
+
+@pytest.mark.parametrize(
+    "text", ['{"asset":0}', '{"asset":{"version":"2.0"},"extensionsRequired":3}', '{"asset":[]}']
+)
+def test_gltf_of_wrong_types_gives_clear_error(text, tmp_path):
+    path = tmp_path / "a.gltf"
+    path.write_text(text)
+    with pytest.raises(MeshFileError, match=r"version none|got 0 meshes"):
+        load(path)
