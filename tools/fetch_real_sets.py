@@ -73,9 +73,7 @@ def read_sets(table: Path = TABLE) -> tuple[RealSet, ...]:
     try:
         return _parse_sets(table)
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise FetchError(
-            f"{table}: is no table of sets: {type(error).__name__}: {error}"
-        ) from error
+        raise FetchError(f"{table}: got {error!r}, expected a table of sets") from error
 
 
 def _parse_sets(table: Path) -> tuple[RealSet, ...]:

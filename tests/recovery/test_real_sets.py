@@ -20,6 +20,7 @@ SPEC = importlib.util.spec_from_file_location("judge_real_sets", ROOT / "tools/j
 TOOL = importlib.util.module_from_spec(SPEC)
 sys.modules["judge_real_sets"] = TOOL  # dataclasses look their module up
 SPEC.loader.exec_module(TOOL)
+FACE = sys.modules["judge_photographs"]
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 
@@ -84,16 +85,16 @@ def test_wrong_lists_of_photographs_are_found(tmp_path, name):
 
 def test_near_lights_explain_face_better():
     real_sets = find_sets("near-face")
-    shown = require_limits(TOOL.judge_face(real_sets))
+    shown = require_limits(FACE.judge_face(real_sets))
     distant = shown["pixels without a normal to the camera, distant lights"]
-    assert distant.ours > TOOL.MAX_FACE_UNFIT
+    assert distant.ours > FACE.MAX_FACE_UNFIT
     limit = shown["median residual over albedo, near lights"].limit
-    gray, mask, positions, *view = TOOL.load_face(real_sets)
-    points = TOOL.face_points_mm(mask, *view)
+    gray, mask, positions, *view = FACE.load_face(real_sets)
+    points = FACE.face_points_mm(mask, *view)
     for order in (np.roll(positions, 1, axis=0), positions[::-1]):
-        residual, unfit = TOOL.fit_face(gray, mask, points, order)
+        residual, unfit = FACE.fit_face(gray, mask, points, order)
         assert residual[1] > limit
-        assert unfit[1] > TOOL.MAX_FACE_UNFIT
+        assert unfit[1] > FACE.MAX_FACE_UNFIT
 
 
 def test_metal_height_follows_from_normals():
