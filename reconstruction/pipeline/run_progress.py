@@ -39,6 +39,8 @@ class RunProgress:
     _started_s: float = 0.0
     _stage_started_s: float = 0.0
     _stage: float = 0.0
+    _fraction: float = 0.0
+    """Fraction of the current stage's tiles that is done."""
 
     def plan(self, stages: Iterable[str]) -> None:
         """Set the stages that will run."""
@@ -47,29 +49,39 @@ class RunProgress:
         }
         self._total = sum(self._waiting.values())
         self._started_s = self.clock()
-        self._stage = 0.0
+        self._stage = self._fraction = 0.0
 
     def begin_stage(self, name: str) -> None:
         """Report the beginning of a stage."""
         self._stage = self._waiting.pop(name, 0.0)
         self._stage_started_s = self.clock()
+        self._fraction = 0.0
         self._report_text(name)
 
     def begin_tile(self, name: str, number: int, total: int) -> None:
         """Report the beginning of a tile; ``number`` earlier ones are done."""
+        self._fraction = number / total
         self._report_text(f"{name}: {number}/{total}" if total > 1 else name)
 
     def seconds_left(self) -> float | None:
-        """Estimate the seconds that are left, by the pace of the stages that are done."""
+        """Estimate the seconds that are left.
+
+        The pace is that of all stages and tiles that are done. The rest of a stage follows from its
+        own tiles, if enough of them are done.
+        """
         rest = sum(self._waiting.values())
-        done = self._total - rest - self._stage
-        if done < MIN_KNOWN_FRACTION * self._total or done <= 0:
+        before = self._total - rest - self._stage
+        now = self.clock()
+        elapsed, in_stage = now - self._started_s, now - self._stage_started_s
+        if self._fraction >= MIN_KNOWN_FRACTION:
+            done = before + self._fraction * self._stage
+            pace = elapsed / done if done > 0.0 else 0.0
+            return in_stage * (1.0 / self._fraction - 1.0) + pace * rest
+        if before < MIN_KNOWN_FRACTION * self._total or before <= 0:
             return None
-        pace = (self._stage_started_s - self._started_s) / done
-        in_stage = self.clock() - self._stage_started_s
+        pace = (elapsed - in_stage) / before
         if self._stage and in_stage > pace * self._stage:  # slower than the stages before it
-            pace = in_stage / self._stage
-            return pace * rest + OVERRUN_FRACTION * in_stage
+            return elapsed / (before + self._stage) * rest + OVERRUN_FRACTION * in_stage
         return pace * (rest + self._stage) - in_stage
 
     def _report_text(self, text: str) -> None:
