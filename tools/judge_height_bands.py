@@ -6,7 +6,8 @@ Each row is a strain step; each column a band of periods, um: root mean square o
 that of the true height within the band, and the band's part of the height's variance; then the
 coverage of the height's 68 and 95 % intervals. A second table has the variances along and across
 the jaws over those of the patch's own true topography, less 1: of the height map, and of
-`histograms.json`, which corrects them for occlusion and noise.
+`histograms.json`, which adds what the
+estimator's filter has removed.
 """
 
 import sys
@@ -21,6 +22,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE
+from reconstruction.pipeline.gradient.strain_kernels import UNRESOLVED_VARIANCE
 from skinrig.appearances.contents import intersect_valid
 from skinrig.evaluating.subsurface import read_document
 
@@ -74,10 +76,9 @@ def _print_variances(estimated: SkinAppearance, true_maps: Mapping[str, SkinMap]
         relief = high_pass(relief, pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=valid)
         angle_rad = np.radians(state["angle_deg"])
         of_truth = measure_normals(relief, pixel=PIXEL_UM, valid=valid, angle_rad=angle_rad)
-        ratios = state["occlusion_ratio_s"], state["occlusion_ratio_t"]
         corrected = state["variance_s"], state["variance_t"]
-        noise = state["noise_variance_s"], state["noise_variance_t"]
-        measured = [v / ratio + n for v, ratio, n in zip(corrected, ratios, noise, strict=True)]
+        lost = state["lost_variance_s"], state["lost_variance_t"]
+        measured = [v / UNRESOLVED_VARIANCE - gone for v, gone in zip(corrected, lost, strict=True)]
         cells = []
         for along, across in (measured, corrected):
             parts = along / of_truth.variance_x - 1.0, across / of_truth.variance_y - 1.0

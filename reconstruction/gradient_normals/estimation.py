@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +46,7 @@ from reconstruction.gradient_normals.moments import (
 from reconstruction.gradient_normals.noise import SensorNoise
 from reconstruction.gradient_normals.patterns import GradientError, Key
 from reconstruction.gradient_normals.sphere_lights import SphereLights, view_frame
+from reconstruction.gradient_normals.wiener import Gain
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tiles import map_on_threads
 
@@ -81,7 +82,7 @@ class Roughness:
     pixels: int
 
 
-Smoothing: TypeAlias = float | tuple[float, float] | Literal["wiener"]
+Smoothing: TypeAlias = float | tuple[float, float] | Literal["wiener"] | Gain
 """Filter of the moments, see :func:`from_patterns`."""
 
 
@@ -132,13 +133,16 @@ def from_patterns(
     points_mm : array_like, shape (H, W, 2) or (H, W, 3), optional
         Positions of the pixels on the patch, rig frame, for lights at a finite distance: directions
         to the lights then vary. Give `view` per pixel, too.
-    smoothing : float, (float, float) or "wiener"
+    smoothing : float, (float, float), "wiener" or function
         Standard deviation of a Gaussian that smooths the moments before any nonlinear step, px; of
         two numbers the second is that of the crossed images, where subsurface scattering removes
         detail. The optics' own blur is a good choice; noise falls about as 1 / (3.5 px). "wiener"
         filters the moments by the fraction of signal at each spatial frequency
         (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics require.
-        Standard errors then include the detail that is lost.
+        Standard errors then include the detail that is lost. A function does the same for specular
+        normals, and multiplies the waves of their light by its value, of cycles per pixel along x
+        and y: the lens's inverse transfer. A lens averages light, not normals, so that blur is to
+        be undone in the light.
     executor : Executor, optional
         Threads to map tiles of rows over; default one thread per core, at most 8.
 
@@ -178,13 +182,18 @@ def from_patterns(
     True
     """
     Checks(GradientError).choice("component", component, ("specular", "diffuse"))
-    wiener = smoothing == "wiener"
-    smooth = (0.0, 0.0) if isinstance(smoothing, str) else tuple(np.broadcast_to(smoothing, 2))
+    sharpen = smoothing if callable(smoothing) else None
+    if sharpen is not None and component != "specular":
+        raise GradientError("smoothing: got a function for diffuse normals, expected a number")
+    wiener = sharpen is not None or smoothing == "wiener"
+    smooth = (0.0, 0.0) if wiener else tuple(np.broadcast_to(cast(Any, smoothing), 2))
     samples = PatternSamples(patterns, variance, valid, saturation)
 
     def normals_of(flat: PatternSamples) -> NormalMaps:
         reflection = _reflection_of(flat, component, lights, smooth)
-        return _normals(reflection, view, lights, alpha, eta, points_mm, wiener, executor)
+        filtered = apply_wiener_filter(reflection, sharpen) if wiener else reflection
+        rough = filtered if sharpen is not None else reflection
+        return _normals(filtered, rough, view, lights, alpha, eta, points_mm, executor)
 
     if samples.channels is None:
         return normals_of(samples)
@@ -195,12 +204,12 @@ def from_patterns(
 
 def _normals(
     reflection: ReflectionMoments,
+    of_roughness: ReflectionMoments,
     view: ArrayLike,
     lights: SphereLights | None,
     alpha: float | Roughness | None,
     eta: float,
     points_mm: ArrayLike | None,
-    wiener: bool,
     executor: Executor | None,
 ) -> NormalMaps:
     shape = reflection.shape
@@ -216,7 +225,7 @@ def _normals(
         )
     else:
         if alpha is None:
-            alpha = _roughness(reflection, lights, middle, eta)
+            alpha = _roughness(of_roughness, lights, middle, eta)
         known = alpha if isinstance(alpha, Roughness) else Roughness(float(alpha), 0.0, 0)
         table = lobe_response.specular_response(
             lights,
@@ -226,8 +235,6 @@ def _normals(
             near=places is not None,
             alpha_stderr=known.stderr,
         )
-    if wiener:
-        reflection = apply_wiener_filter(reflection)
     return _maps(
         MomentInversion.prepare(reflection, table, lights, eta), each_view, places, executor
     )
@@ -244,11 +251,13 @@ def estimate_roughness(
     eta: float = ETA_SKIN,
     smooth_px: float = 0.0,
     smooth_crossed_px: float | None = None,
+    sharpen: Gain | None = None,
 ) -> Roughness:
     """Estimate the roughness under which the map's specular moment vectors have their lengths.
 
     Relative to the full light the vector is shorter for a wider lobe. Parameters and errors are
-    those of :func:`from_patterns`.
+    those of :func:`from_patterns`; with `sharpen` the moments are filtered, and the roughness is
+    that of the restored reflection, without the lens's mixture of neighbors.
 
     Returns
     -------
@@ -266,6 +275,8 @@ def estimate_roughness(
         samples = samples.sum_channels()
     smooth = smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px
     reflection = _reflection_of(samples, "specular", lights, smooth)
+    if sharpen is not None:
+        reflection = apply_wiener_filter(reflection, sharpen)
     found = _roughness(reflection, lights, normalize_views(view, reflection.shape)[0], eta)
     if found.pixels == 0:
         raise GradientError(

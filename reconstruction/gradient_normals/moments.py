@@ -16,7 +16,7 @@ from reconstruction.gradient_normals.patterns import (
     PatternStack,
     require_patterns,
 )
-from reconstruction.gradient_normals.wiener import filter_image
+from reconstruction.gradient_normals.wiener import Gain, filter_image
 
 TILE_PIXELS = 65_536
 _VALUE_ROWS = slice(moment_kernels.C_0, moment_kernels.V_0)
@@ -239,11 +239,14 @@ def prepare_moments(
     )
 
 
-def apply_wiener_filter(reflection: ReflectionMoments) -> ReflectionMoments:
+def apply_wiener_filter(
+    reflection: ReflectionMoments, sharpen: Gain | None = None
+) -> ReflectionMoments:
     """Filter a reflection's moments by the fraction of signal at each frequency.
 
     Diffuse moments are filtered first, then the parallel ones less these: the specular reflection
-    has finer detail than the diffuse one.
+    has finer detail than the diffuse one. `sharpen` multiplies the waves of the specular reflection
+    alone.
 
     Raises
     ------
@@ -276,7 +279,9 @@ def apply_wiener_filter(reflection: ReflectionMoments) -> ReflectionMoments:
         if not two:
             raw[0][m], shares[0, m] = glow, kept
             continue
-        spark, left = filter_image(raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid)
+        spark, left = filter_image(
+            raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid, sharpen
+        )
         raw[0][m], raw[1][m] = spark + glow, glow
         shares[:, m] = left, left * kept
     return replace(

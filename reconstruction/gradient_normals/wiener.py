@@ -5,6 +5,8 @@ white noise has equal power at all. With the noise known, the spectrum of a mome
 fraction of signal at each frequency, which is the Wiener filter (Wiener 1949).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import fft
 from scipy.ndimage import gaussian_filter, uniform_filter
@@ -16,8 +18,13 @@ PAD_PX = 24
 SPECTRUM_BANDS = 64
 """Number of bands over the spectrum's width, within which it is averaged."""
 
+Gain = Callable[[FloatArray, FloatArray], FloatArray]
+"""Factor of each wave, by its cycles per pixel along x and y, which broadcast; 1 at zero."""
 
-def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[FloatArray, float]:
+
+def filter_image(
+    image: FloatArray, variance: float, valid: BoolArray, gain: Gain | None = None
+) -> tuple[FloatArray, float]:
     """Filter an image to its most probable signal; return it with its remaining error.
 
     Parameters
@@ -27,6 +34,9 @@ def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[
     variance : float
         Mean variance of the noise over the image.
     valid : ndarray of bool, shape (H, W)
+    gain : Gain, optional
+        Inverse of what weakened the signal before the noise was added, to be undone; 0 where a wave
+        is lost. None: 1 everywhere.
 
     Returns
     -------
@@ -34,7 +44,7 @@ def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[
         Mirrored or smoothed from its neighbors where not valid.
     share : float
         Mean square error of `picture` over `variance`, of remaining noise and lost signal
-        together, 0 to 1.
+        together, >= 0; without `gain` at most 1. Waves that the gain omits do not count.
 
     Examples
     --------
@@ -59,8 +69,13 @@ def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[
     power = np.abs(fft.rfft2(wide * window)) ** 2 / float(np.sum(window.astype(np.float64) ** 2))
     power = _averaged(power.astype(np.float64), wide.shape)
     keep = np.maximum(power - variance, 0.0) / np.maximum(power, 1e-300)
+    most, error = 1.0, keep
+    if gain is not None:
+        factor = gain(fft.rfftfreq(wide.shape[1])[None], fft.fftfreq(wide.shape[0])[:, None])
+        most, error = float(np.max(factor)) ** 2, keep * factor**2
+        keep = keep * factor
     # the mean is kept whole, with its own noise
-    share = min(_full_mean(keep, wide.shape[1]) + 1.0 / float(valid.sum()), 1.0)
+    share = min(_full_mean(error, wide.shape[1]) + 1.0 / float(valid.sum()), most)
     out = fft.irfft2(fft.rfft2(wide) * keep.astype(kind), s=wide.shape)
     (top, _), (left, _) = pads
     inner = out[top : top + height, left : left + width]

@@ -96,6 +96,19 @@ class Aperture:
         lens = 2 / np.pi * (np.arccos(radius) - radius * np.sqrt(1.0 - radius**2))
         return lens * np.sinc(per_um_x * self.pixel_um) * np.sinc(per_um_y * self.pixel_um)
 
+    def restore(self, per_px_x: FloatArray, per_px_y: FloatArray) -> Float64Array:
+        """Return the inverse transfer by cycles per pixel, up to `MAX_GAIN`; 0 beyond the cutoff.
+
+        Examples
+        --------
+        >>> lens = Aperture(18.0, 6.0)
+        >>> lens.restore(np.array([0.0, 1 / 6, 1 / 3 + 0.02]), np.zeros(3)).round(3).tolist()
+        [1.0, 2.678, 0.0]
+        """
+        x, y = np.asarray(per_px_x) / self.pixel_um, np.asarray(per_px_y) / self.pixel_um
+        gain = np.minimum(1.0 / np.maximum(self.transfer(x, y), 1e-6), MAX_GAIN)
+        return np.where(np.hypot(x, y) * self.cutoff_um > NOISE_CUTOFF_RATIO, 0.0, gain)
+
 
 @dataclass(frozen=True, slots=True)
 class RestoredNormals:
@@ -111,18 +124,22 @@ class RestoredNormals:
         The same after it.
     filter : ndarray, shape (H + 64, W + 64)
         Factor of each wave, on the grid of `scipy.fft.fftfreq`.
+    error_filter : ndarray, shape (H + 64, W + 64)
+        Factor by which a wave of white noise gets the variance of the restored slopes' error: of
+        noise that passes the filter, and of relief below the noise that does not.
     """
 
     normals: FloatArray
     noise: float
     kept_noise: float
     filter: Float64Array
+    error_filter: Float64Array
 
-    def sample_noise(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
-        """Draw the remaining noise of both slopes, each of shape (H, W)."""
+    def sample_errors(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
+        """Draw errors of both slopes by noise and lost relief, each of shape (H, W)."""
         shape = self.normals.shape[:2]
         x, y = (
-            filter_by_transfer(self.noise * rng.standard_normal(shape), self.filter)
+            filter_by_transfer(self.noise * rng.standard_normal(shape), self.error_filter)
             for _ in range(2)
         )
         return x, y
@@ -198,7 +215,9 @@ def restore_normals(
     noise = math.sqrt(noise_power / power.size)
     applied = wiener * smoothing
     kept = noise * math.sqrt(float(np.mean(applied**2)))
-    return RestoredNormals(found.astype(normals.dtype), noise, kept, applied)
+    # of S = share (S + N) the filter keeps the share, and of N as much: the error is share N
+    error = np.where(beyond, 0.0, np.sqrt(share) * gain) * smoothing
+    return RestoredNormals(found.astype(normals.dtype), noise, kept, applied, error)
 
 
 def _padded(values: Float64Array) -> Float64Array:

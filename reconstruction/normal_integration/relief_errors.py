@@ -27,7 +27,7 @@ HOLE_REACH_UM: Final = 84.0
 """Distance from such a pixel at which this error is 1/e of that, um."""
 MAX_SLOPE_VARIANCE: Final = 1.0
 """Larger variances count as this: such walls are hidden, not measured."""
-RELATIVE_SLOPE_ERROR: Final = 0.055
+RELATIVE_SLOPE_ERROR: Final = 0.08
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
 DIFFUSE_SCALE_MM: Final = 0.15
 """Standard deviation of the Gaussian that smooths the surface whose normals diffuse normals are."""

@@ -21,7 +21,6 @@ from model.skin import SkinAppearance
 from reconstruction.gradient_normals import estimate_roughness, from_patterns
 from reconstruction.gradient_normals.patterns import MissingPatternsError, require_patterns
 from reconstruction.photometric_stereo.light_selection import rayleigh_mixture_median
-from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array
 from skinrig.planning import plan_omissions, plans, time_budget
@@ -46,13 +45,17 @@ EXPOSURE_CHOICES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Multiples of the rig's nominal exposure time."""
 MAX_SIGNAL_FRACTION = 0.98
 """Upper limit of the 99.9th percentile of pixels, fraction of full scale."""
-UNMODELED_TILT_RAD = math.radians(0.2)
+UNMODELED_TILT_RAD = math.radians(0.65)
 """Error of each tilt that the standard uncertainties omit: shadows in grooves and deviations from
-the assumed lobe; see docs/validation/forecasts.md."""
+the assumed lobe, 0.08 of the slopes of a forehead; see docs/validation/forecasts.md."""
 FORECAST_RELATIVE_SD = {"normals": 0.2}
 """Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 WHOLE_READOUT_S = PATTERN_DWELL_S - PATTERN_EXPOSURE_S
 """Time between two exposures: read-out and settling of the LEDs."""
+
+
+SMOOTH_PX = 1.0
+"""Blur of the images before facet roughness is estimated: the lens resolves three pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +109,8 @@ def predict(observation: GradientObservation, setting: GradientScanSettings) -> 
     found = from_patterns(values, variance=variance, smoothing="wiener", alpha=alpha, **known)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
-    tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
+    # of two directions, and of the half of the variance that belongs to a surface
+    tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / 2.0
     median_rad = rayleigh_mixture_median(np.hypot(tilt, UNMODELED_TILT_RAD))
     return GradientPrediction(median_rad, rayleigh_mixture_median(tilt), float(valid.mean()))
 

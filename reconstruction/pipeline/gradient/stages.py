@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from scipy import ndimage
 
 from capture.calibration.led_sphere.lights import SphereLightTable, SpherePolarizers
 from capture.calibration.sensor import SensorCalibration
@@ -19,21 +18,20 @@ from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
 from reconstruction.gradient_normals.estimation import Smoothing
-from reconstruction.gradient_normals.occlusion import estimate_occlusion_ratios
 from reconstruction.gradient_normals.sphere_lights import SphereLights
-from reconstruction.normal_histogram.relief_slopes import slopes
 from reconstruction.normal_histogram.statistics import NormalStatistics
-from reconstruction.normal_integration import HeightMap, integrate_map, relief_errors
-from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.normal_integration.lens_restoration import (
-    Aperture,
-    RestoredNormals,
-    restore_normals,
-)
+from reconstruction.normal_integration import relief_errors
+from reconstruction.normal_integration.lens_restoration import Aperture
 from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.gradient.images import GradientImages, SkinState, StatePatterns
+from reconstruction.pipeline.gradient.patch_relief import (
+    CUTOFF_UM,
+    PatchOptics,
+    PatchRelief,
+    estimate_relief,
+)
 from reconstruction.pipeline.gradient.pattern_diagnosis import diagnose_states
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
@@ -41,14 +39,14 @@ from reconstruction.pipeline.gradient.strain_kernels import (
     count_normals,
     fit_kernels,
     histogram_document,
-    noise_variances,
+    lost_variances,
 )
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 _log = logging.getLogger(__name__)
 
-STAGE_REVISION = 15
+STAGE_REVISION = 16
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -58,17 +56,11 @@ FILE_NAMES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
 FAULT_LOG = "_diagnosed"
 """Product of the stage that judges the patterns before any map is made of them."""
-CUTOFF_UM = 1000.0
-"""Longest wavelength of the surface topography (Nagano et al. 2015, section 4)."""
-SMOOTH_PX = 1.0
-"""Blur of the images before facet roughness is estimated: the lens resolves three pixels."""
 CROSSED_SMOOTH_PX = 2.0
 """Blur of the crossed images, which have half the noise and less detail."""
 DIFFUSE_SMOOTH_PX = 2.0
 WAVELENGTH_UM = 0.535
 """Mean wavelength of a white LED's light on a monochrome sensor."""
-STDERR_SAMPLES = 6
-STDERR_SIGMA_PX = 8.0
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
@@ -124,7 +116,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     stage = inputs.stage_maker(STAGE_REVISION)
     neutral = rig.images.neutral.name
     heights = " ".join(f"height_{state.name}" for state in rig.images.states)
-    noises = " ".join(f"_slope_noise_{state.name}" for state in rig.images.states)
+    errors = " ".join(f"_slope_error_{state.name}" for state in rig.images.states)
     diffuse, counted = f"diffuse_normals_{neutral}", f"{HISTOGRAM_FILE} _histograms"
     kernels = partial(_kernels, inputs, rig)
     strain, facets = partial(_strain, inputs, rig), partial(_facets, inputs, rig)
@@ -133,19 +125,17 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("strain", FAULT_LOG, f"_strains {STRAIN_FILE}", _diagnosed(strain)),
         stage("facets", FAULT_LOG, "_facets", _diagnosed(facets)),
         stage(f"diffuse normals {neutral}", FAULT_LOG, diffuse, _diagnosed(partial(_diffuse, rig))),
-        stage(
-            "histograms", f"_strains _facets {heights} {noises}", counted, partial(_histograms, rig)
-        ),
+        stage("histograms", f"_strains {heights} {errors}", counted, partial(_histograms, rig)),
         stage("kernels", f"_strains _histograms {heights}", KERNEL_FILE, kernels),
     ]
     for state in rig.images.states:
-        name, restored = state.name, f"_restored_{state.name}"
-        normals, height = partial(_normals, rig, state), partial(_height, rig, state)
+        name, relief = state.name, f"_relief_{state.name}"
+        normals, height = partial(_normals, rig, state), partial(_heights, name)
         crossed = partial(_crossed, rig, state)
         made += [
             stage(f"crossed {name}", FAULT_LOG, f"crossed_{name}", _diagnosed(crossed)),
-            stage(f"normals {name}", "_facets", f"normals_{name} {restored}", normals),
-            stage(f"height {name}", restored, f"height_{name} _slope_noise_{name}", height),
+            stage(f"normals {name}", "_facets", f"normals_{name} {relief}", normals),
+            stage(f"height {name}", relief, f"height_{name} _slope_error_{name}", height),
         ]
     return made
 
@@ -283,29 +273,30 @@ def _facets(inputs: Inputs, rig: GradientRig) -> Roughness:
         view=rig.views(patterns.shape),
         variance=patterns.variance,
         valid=patterns.valid,
-        smooth_px=SMOOTH_PX,
+        sharpen=rig.lens.restore,
     )
     inputs.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
     return found
 
 
 def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[str, Any]:
-    """Return normals blurred by the lens, and slopes of the surface with the blur removed."""
+    """Return normals as the lens resolves them, and the relief with the lens's blur removed."""
     patterns = rig.images.of(state)
-    skin = skin_mask(patterns.crossed())
-    smooth = _patterns_normals(rig, patterns, "specular", smoothing="wiener", alpha=_facets)
-    sharp = _patterns_normals(rig, patterns, "specular", alpha=_facets)
-    # noise moves single pixels of steep grooves outside the range of a lobe; a hole there would cut
-    # the height map, so these pixels take the filtered normal
-    normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
-    known = (sharp.valid | smooth.valid) & skin
-    grooves = relief_errors.normal_stderr
-    shown = _normal_map(smooth, skin, "of the surface's reflection", grooves)
-    restored = restore_normals(normals, lens=rig.lens, valid=known)
-    return {
-        f"normals_{state.name}": shown,
-        f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
-    }
+    shape, skin = patterns.shape, skin_mask(patterns.crossed())
+    normals_of = partial(_patterns_normals, rig, patterns, "specular", alpha=_facets)
+    blurred = normals_of(smoothing="wiener")
+    clear = normals_of(smoothing=rig.lens.restore)
+    camera = rig.perspective(shape)
+    optics = PatchOptics(rig.pixel_um, camera, rig.lens, rig.lights, _facets.alpha)
+    relief = estimate_relief(clear, normals_of(), blurred, skin, optics, name=state.name)
+    found = dataclasses.replace(
+        blurred,
+        normals=relief.seen_normals(),
+        valid=relief.surface.valid & blurred.valid,
+        stderr_rad=blurred.stderr_rad / math.sqrt(2.0),
+    )
+    shown = _normal_map(found, skin, "of a continuous surface", relief_errors.normal_stderr)
+    return {f"normals_{state.name}": shown, f"_relief_{state.name}": relief}
 
 
 def _diffuse(rig: GradientRig) -> SkinMap:
@@ -338,92 +329,32 @@ def _normal_map(
     )
 
 
-def _height(rig: GradientRig, state: SkinState, **made: Any) -> Mapping[str, Any]:
-    """Integrate the deblurred slopes; remove wavelengths above `CUTOFF_UM`.
-
-    Also returns the variance of one slope's noise per pixel.
-    """
-    restored: RestoredNormals
-    valid: BoolArray
-    restored, valid, stderr_rad = made[f"_restored_{state.name}"]
-    shape = valid.shape
-
-    def relief(normals: FloatArray, known: BoolArray) -> HeightMap:
-        # steep walls of grooves are dim and partly hidden, so they have less weight
-        found = integrate_map(
-            normals,
-            valid=known,
-            pixel=rig.pixel_um,
-            camera=rig.perspective((shape[0], shape[1])),
-            stderr_rad=stderr_rad,
-        )
-        height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
-        return dataclasses.replace(found, height=height)
-
-    found = relief(restored.normals, valid)
-    found.convergence.warn_unless_converged(f"height of {state.name}", _log)
-    by_noise, slope_noise = _height_noise(restored, found.valid, relief, rig.pixel_um)
-    stderr = relief_errors.height_stderr(found.height, by_noise, found.valid, pixel_um=rig.pixel_um)
+def _heights(name: str, **made: Any) -> Mapping[str, Any]:
+    """Return the map of heights, and the variance of one slope's error per pixel."""
+    relief: PatchRelief = made[f"_relief_{name}"]
+    by_noise, slope_error = relief.sample_errors()
+    height, valid, pixel_um = relief.height(), relief.surface.valid, relief.optics.pixel_um
+    stderr = relief_errors.height_stderr(height, by_noise, valid, pixel_um=pixel_um)
     what = (
-        "height towards the camera, the lens's blur removed as far as noise allows, without "
-        f"wavelengths above {CUTOFF_UM / 1e3:g} mm"
+        "height towards the camera, the lens's blur removed as far as noise allows, corrected for "
+        f"lights that the relief hides, without wavelengths above {CUTOFF_UM / 1e3:g} mm"
     )
-    return {
-        f"height_{state.name}": SkinMap(
-            found.height.astype(np.float32), "um", stderr, found.valid, what
-        ),
-        f"_slope_noise_{state.name}": slope_noise,
-    }
+    found = SkinMap(height.astype(np.float32), "um", stderr, valid, what)
+    return {f"height_{name}": found, f"_slope_error_{name}": slope_error}
 
 
-def _height_noise(
-    restored: RestoredNormals,
-    valid: BoolArray,
-    relief: Callable[[FloatArray, BoolArray], HeightMap],
-    pixel_um: float,
-) -> tuple[Float32Array, Float32Array]:
-    """Return a height's standard error, and the noise variance of one slope, each (H, W).
-
-    Random noise fields are integrated in the same way. A pixel without slopes has variance 0.
-    """
-    rng = np.random.default_rng(0)
-    total, of_slopes = np.zeros(valid.shape), np.zeros(valid.shape)
-    for _ in range(STDERR_SAMPLES):
-        x, y = restored.sample_noise(rng)
-        field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
-        height = relief(field, valid).height.astype(np.float64)
-        total += height**2
-        slope_x, slope_y, _ = slopes(height, pixel=pixel_um, valid=valid)
-        of_slopes += 0.5 * (slope_x**2 + slope_y**2)
-    # noise is nearly stationary, so its variance is smooth except at borders
-    weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
-    even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
-    stderr = np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
-    return stderr, (of_slopes / STDERR_SAMPLES).astype(np.float32)
-
-
-def _histograms(
-    rig: GradientRig, _strains: list[StateStrain], _facets: Roughness, **made: Any
-) -> Mapping[str, Any]:
+def _histograms(rig: GradientRig, _strains: list[StateStrain], **made: Any) -> Mapping[str, Any]:
     by_state = _by_state(made)
-    noise = _by_state(made, "_slope_noise_")
+    errors = _by_state(made, "_slope_error_")
     found = count_normals(_strains, by_state, pixel_um=rig.pixel_um)
-    occlusion, by_noise = {}, {}
+    lost = {}
     for each in _strains:
         name, height = each.state.name, by_state[each.state.name]
         if name in found:
             counted = common_skin(each, _strains[0], by_state)
             axis = {"pixel_um": rig.pixel_um, "angle_rad": each.state.angle_rad}
-            by_noise[name] = noise_variances(height.values, noise[name], valid=counted, **axis)
-            occlusion[name] = estimate_occlusion_ratios(
-                height.values,
-                height.mask,
-                lights=rig.lights,
-                alpha=_facets.alpha,
-                counted=counted,
-                **axis,
-            )
-    document = histogram_document(_strains, found, occlusion, by_noise)
+            lost[name] = lost_variances(height.values, errors[name], valid=counted, **axis)
+    document = histogram_document(_strains, found, lost)
     return {"_histograms": found, HISTOGRAM_FILE: stages.serialize_document(document)}
 
 

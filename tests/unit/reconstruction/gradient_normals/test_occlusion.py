@@ -1,18 +1,29 @@
-"""Variance of slopes that grooves hide from gradient light."""
+"""Normals corrected for the lights that a relief hides from its own grooves."""
 
 import math
 
 import numpy as np
 import pytest
 
+from model.fresnel import ETA_SKIN
 from reconstruction.gradient_normals import GradientError, SphereLights
+from reconstruction.gradient_normals.lobe_response import direction_from_moments, specular_sums
 from reconstruction.gradient_normals.occlusion import (
     HORIZON_DIRECTIONS,
-    estimate_occlusion_ratios,
-    find_horizons,
+    HORIZON_REACH_UM,
+    HORIZON_SOFTNESS_RAD,
+    HORIZON_STEP_RATIO,
+    SOLVER_STEPS,
+    correct_occlusion,
+)
+from reconstruction.gradient_normals.sphere_lights import (
+    disc_from_normal,
+    normal_from_disc,
+    view_frame,
 )
 
 PIXEL_UM = 6.0
+ALPHA = 0.25
 
 
 def even_sphere(count=200):
@@ -29,82 +40,129 @@ def grooves(depth_um, side=96, period_px=24):
     return np.tile(wave, (side, 1))
 
 
-def ratios(relief, **settings):
-    valid = np.ones(relief.shape, bool)
-    return estimate_occlusion_ratios(
-        relief, valid, pixel_um=PIXEL_UM, lights=even_sphere(), alpha=0.25, **settings
-    )
+def normals_of(relief):
+    down, right = np.gradient(relief, PIXEL_UM)
+    normals = np.stack([-right, down, np.ones_like(relief)], axis=-1)
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def test_horizons_of_a_step_follow_its_height():
-    """A wall of height h at distance d hides what is below h / d; behind it nothing is hidden."""
-    relief = np.zeros((41, 41))
-    relief[:, 31:] = 12.0  # 9 pixels from the first one
-    found = find_horizons(relief, [20, 20], [22, 38], pixel_um=PIXEL_UM)
-    assert found[0, 0] == pytest.approx(12.0 / (9 * PIXEL_UM))
-    assert found[0, HORIZON_DIRECTIONS // 2] == 0.0
-    assert found[1].max() < 1e-12
+def correct(relief, normals=None, valid=None, **settings):
+    valid = np.ones(relief.shape, bool) if valid is None else valid
+    normals = normals_of(relief) if normals is None else normals
+    usual = {"pixel_um": PIXEL_UM, "lights": even_sphere(), "alpha": ALPHA}
+    return correct_occlusion(normals, relief, valid, **(usual | settings))
 
 
-def test_horizons_turn_counterclockwise_from_the_right():
-    relief = np.zeros((41, 41))
-    relief[:10] = 50.0  # a wall at the top of the image
-    (found,) = find_horizons(relief, [20], [20], pixel_um=PIXEL_UM)
-    assert found[HORIZON_DIRECTIONS // 4] == found.max() > 0.5
-    assert found[HORIZON_DIRECTIONS // 2 :].max() < 1e-12
+def plain_place(relief, row, column, lights):
+    """Return one pixel's place in plain Python: horizons by sampling, then all lights."""
+    side_y, side_x = relief.shape
+
+    def height(y, x):
+        y, x = min(max(y, 0.0), side_y - 1.0), min(max(x, 0.0), side_x - 1.0)
+        i, j = min(int(y), side_y - 2), min(int(x), side_x - 2)
+        v, u = y - i, x - j
+        upper = (1 - u) * relief[i, j] + u * relief[i, j + 1]
+        lower = (1 - u) * relief[i + 1, j] + u * relief[i + 1, j + 1]
+        return (1 - v) * upper + v * lower
+
+    count = math.ceil(math.log(HORIZON_REACH_UM / PIXEL_UM, HORIZON_STEP_RATIO))
+    steps = sorted({round(HORIZON_STEP_RATIO**k) for k in range(count + 1)})
+    horizon = np.zeros(HORIZON_DIRECTIONS)
+    for k in range(HORIZON_DIRECTIONS):
+        turn = 2 * math.pi * k / HORIZON_DIRECTIONS
+        for step in steps:
+            there = height(row - step * math.sin(turn), column + step * math.cos(turn))
+            tangent = (there - relief[row, column]) / (step * PIXEL_UM)
+            horizon[k] = max(horizon[k], math.atan(tangent))
+    ways = lights.directions
+    elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1]))
+    turn = np.arctan2(ways[:, 1], ways[:, 0]) % (2 * math.pi)
+    circle = np.append(horizon, horizon[0])
+    angles = 2 * math.pi * np.arange(HORIZON_DIRECTIONS + 1) / HORIZON_DIRECTIONS
+    free = 0.5 + 0.5 * (elevation - np.interp(turn, angles, circle)) / HORIZON_SOFTNESS_RAD
+    each = specular_sums(lights, view_frame((0.0, 0.0, 1.0)), ALPHA, ETA_SKIN)
+
+    def observed(place, visible):
+        parts = each(normal_from_disc(place[None]), np.zeros(3)) * visible
+        return direction_from_moments(parts @ ways, True)[0][0]
+
+    first = disc_from_normal(normals_of(relief)[row, column])
+    place = first
+    for _ in range(SOLVER_STEPS):
+        place = place + observed(first, 1.0) - observed(place, np.clip(free, 0.0, 1.0))
+    return place
+
+
+def test_correction_equals_a_plain_sum_over_lights():
+    rng = np.random.default_rng(3)
+    relief = 1.5 * rng.standard_normal((9, 11)).cumsum(axis=1)
+    found = disc_from_normal(correct(relief))
+    for row, column in ((0, 0), (4, 5), (8, 10), (3, 1)):
+        expected = plain_place(relief, row, column, even_sphere())
+        assert found[row, column] == pytest.approx(expected, abs=1e-9), (row, column)
+    assert np.abs(found - disc_from_normal(normals_of(relief))).max() > 0.01
 
 
 def test_flat_relief_hides_nothing():
-    found = ratios(np.zeros((32, 32)))
-    assert (found.along, found.across) == (1.0, 1.0)
+    flat = np.zeros((32, 32))
+    tilted = normals_of(np.tile(0.2 * PIXEL_UM * np.arange(32.0), (32, 1)))
+    assert correct(flat, tilted) == pytest.approx(tilted, abs=1e-15)
 
 
-def test_deeper_grooves_hide_more_of_their_variance():
-    found = [ratios(grooves(depth)) for depth in (10.0, 30.0, 60.0)]
-    along = [one.along for one in found]
-    assert (np.diff(along) > 0.0).all()
-    assert along[-1] > 1.05
-    assert np.all(np.diff([one.visible_fraction for one in found]) < 0.0)
-    assert [one.across for one in found] == [1.0, 1.0, 1.0]
+def test_deeper_grooves_are_corrected_more():
+    change = []
+    for depth in (10.0, 30.0, 60.0):
+        relief = grooves(depth)
+        change.append(np.var(correct(relief)[..., 0]) / np.var(normals_of(relief)[..., 0]))
+        assert np.abs(correct(relief)[..., 1]).max() < 0.02  # lights are not quite symmetric
+    assert (np.diff(change) > 0.0).all()
+    assert change[0] > 1.0
+    assert change[-1] > 1.05
 
 
-def test_ratios_turn_with_the_jaws():
-    along = ratios(grooves(60.0))
-    across = ratios(grooves(60.0), angle_rad=math.pi / 2)
-    assert across.across == pytest.approx(along.along, rel=1e-9)
-
-
-def test_wide_map_has_ratios_of_small_one():
-    """512 inner columns are a multiple of the period: even steps would sample one phase.
-
-    Tolerance: 8192 of the pixels are sampled, and borders of the small map hide nothing.
-    """
-    wide, small = (
-        ratios(grooves(60.0, side=side, period_px=32)).along for side in (514, 2 + 2 * 32)
-    )
-    assert small > 1.05
-    assert wide - 1.0 == pytest.approx(small - 1.0, rel=0.15)
-
-
-def test_uncounted_pixels_cast_shadows_only():
+def test_walls_are_made_steeper():
     relief = grooves(60.0)
-    left = np.arange(96) < 48
-    flat = np.where(left, relief, relief[:, 47:48])
-    counted = np.broadcast_to(left, relief.shape)
-    whole, half = ratios(relief), ratios(flat, counted=counted)
-    assert half.along == pytest.approx(whole.along, rel=0.03)
-    assert ratios(flat).along == pytest.approx(half.along, rel=0.03)
-    walls = np.where(left, 0.0, relief)
-    assert ratios(walls).along > 1.05
-    assert ratios(walls, counted=counted & (np.arange(96) < 47)).along == 1.0
+    before, after = normals_of(relief)[48], correct(relief)[48]
+    steep = np.abs(before[:, 0]) > 0.3
+    assert steep.any()
+    assert (np.abs(after[steep, 0]) > np.abs(before[steep, 0])).all()
 
 
-def test_mask_without_inner_pixels_is_refused():
-    with pytest.raises(GradientError, match="valid"):
-        estimate_occlusion_ratios(
-            np.zeros((8, 8)),
-            np.zeros((8, 8), bool),
-            pixel_um=PIXEL_UM,
-            lights=even_sphere(),
-            alpha=0.25,
-        )
+def test_correction_turns_with_the_relief():
+    """Relief and lights turned by half: each normal turns with them."""
+    lights = even_sphere()
+    turned_lights = SphereLights(lights.directions * [-1.0, -1.0, 1.0], analyzer=(0.0, 1.0, 0.0))
+    rng = np.random.default_rng(4)
+    relief = 2.0 * rng.standard_normal((12, 12)).cumsum(axis=1)
+    found = correct(relief, lights=SphereLights(lights.directions, analyzer=(0.0, 1.0, 0.0)))
+    turned = correct(relief[::-1, ::-1].copy(), lights=turned_lights)[::-1, ::-1]
+    assert turned * [-1.0, -1.0, 1.0] == pytest.approx(found, abs=1e-9)
+
+
+def test_hole_neither_shadows_nor_changes():
+    relief = grooves(30.0)
+    valid = np.ones(relief.shape, bool)
+    valid[40:44, 40:44] = False
+    holed = np.where(valid, relief, -1e6)
+    normals = normals_of(relief)
+    found = correct(holed, normals, valid)
+    assert (found[~valid] == normals[~valid]).all()
+    far = np.ones_like(valid)
+    far[30:54, 30:54] = False
+    assert found[far] == pytest.approx(correct(relief, normals)[far], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("valid", {"valid": np.zeros((96, 96), bool)}),
+        ("pixel_um", {"pixel_um": 0.0}),
+        ("alpha", {"alpha": 0.0}),
+        ("height", {"relief": np.full((96, 96), np.nan)}),
+        ("normals", {"normals": np.zeros((96, 96, 2))}),
+    ],
+)
+def test_bad_input_is_named(name, settings):
+    given = {"relief": grooves(10.0), "normals": normals_of(grooves(10.0))} | settings
+    with pytest.raises(GradientError, match=name):
+        correct(**given)

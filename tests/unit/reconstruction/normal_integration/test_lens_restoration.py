@@ -77,10 +77,17 @@ def test_noise_is_estimated_beyond_lens_cutoff():
     assert found.kept_noise < found.noise
 
 
-def test_remaining_noise_matches_sampled_fields():
-    found = restore_normals(normals_of(seen(bumps(), 0.03)), lens=LENS, valid=ALL)
-    drawn = found.sample_noise(np.random.default_rng(5))
-    assert np.std(drawn[0]) == pytest.approx(found.kept_noise, rel=0.2)
+def test_sampled_errors_match_those_of_the_restored_slopes():
+    """Noise that passes the filter and relief that does not; noise alone is less.
+
+    A fraction of signal scatters above 0 where there is none, so that errors may be 1.5 times.
+    """
+    true = bumps(correlation_px=2.5)
+    found = restore_normals(normals_of(seen(true, 0.05)), lens=LENS, valid=ALL)
+    drawn = found.sample_errors(np.random.default_rng(5))
+    left = slope_error(found, true)
+    assert 0.95 * left < np.std(drawn) < 1.5 * left
+    assert found.kept_noise < left
 
 
 def test_a_flat_patch_stays_flat():

@@ -8,7 +8,6 @@ from scipy import ndimage
 
 from capture.plan.gradient import state_name
 from model.skin import SkinMap
-from reconstruction.gradient_normals.occlusion import OcclusionRatios
 from reconstruction.normal_histogram.blocks import (
     BLOCKS_PER_SIDE,
     assign_blocks,
@@ -19,12 +18,13 @@ from reconstruction.pipeline.gradient.images import SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
     HIDDEN_VARIANCE_RATIO,
+    UNRESOLVED_VARIANCE,
     _along_x,
     _skin_blocks,
     count_normals,
     fit_kernels,
     histogram_document,
-    noise_variances,
+    lost_variances,
 )
 from reconstruction.registration.strain import Strain
 
@@ -139,52 +139,53 @@ def test_variance_errors_include_detail_hidden_in_images(fitted):
 
 
 @pytest.mark.long
-def test_variances_lose_noise_and_regain_hidden_slopes(fitted):
+def test_variances_regain_what_the_filter_removed(fitted):
     strains, counted, _, _ = fitted
     plain = histogram_document(strains, counted)["states"]
     names = [row["name"] for row in plain]
-    ratios = dict.fromkeys(names, OcclusionRatios(1.2, 1.1, 0.9))
-    corrected = histogram_document(strains, counted, ratios, dict.fromkeys(names, (1e-3, 2e-3)))[
-        "states"
-    ]
+    corrected = histogram_document(strains, counted, dict.fromkeys(names, (1e-3, 2e-3)))["states"]
     for before, after in zip(plain, corrected, strict=True):
-        assert after["variance_s"] == pytest.approx(1.2 * (before["variance_s"] - 1e-3))
-        assert after["variance_t"] == pytest.approx(1.1 * (before["variance_t"] - 2e-3))
-        assert after["variance_s_stderr"] == pytest.approx(1.2 * before["variance_s_stderr"])
+        assert after["variance_s"] == pytest.approx(
+            before["variance_s"] + 1e-3 * UNRESOLVED_VARIANCE
+        )
+        assert after["variance_t"] == pytest.approx(
+            before["variance_t"] + 2e-3 * UNRESOLVED_VARIANCE
+        )
+        assert after["variance_s_stderr"] == before["variance_s_stderr"]
         np.testing.assert_array_equal(after["counts"], before["counts"])
 
 
 @pytest.mark.parametrize(("steepness", "angle_deg"), [(0.5, 0.0), (1.0, 35.0)])
-def test_noisy_relief_has_variances_of_clean_one(steepness, angle_deg):
-    """Grooves with white noise of their heights, against the normals of the clean grooves.
+def test_smooth_relief_has_variances_of_rough_one(steepness, angle_deg):
+    """Grooves without their finest part, white heights, against the normals of all of it.
 
     Rationale: a slope of two pixels' difference has half the heights' variance over the pixel's
-    square. Tolerance: 3 % for terms of higher order in the noise. Without the normals' derivatives
-    the slopes' noise would subtract up to a tenth.
+    square. Tolerance: 3 % for terms of higher order in the part. Without the normals' derivatives
+    the slopes' variance would add up to a tenth.
     """
     rng = np.random.default_rng(8)
-    slope_noise = 0.02 * steepness
+    slope_error = 0.02 * steepness
     waves = ndimage.gaussian_filter(rng.standard_normal((600, 600)), (12.0, 4.0))
     across, along = np.gradient(waves)
     clean = PIXEL_UM * waves * steepness / np.hypot(across.std(), along.std())
-    noise = PIXEL_UM * math.sqrt(2.0 * slope_noise) * rng.standard_normal(clean.shape)
+    finest = PIXEL_UM * math.sqrt(2.0 * slope_error) * rng.standard_normal(clean.shape)
     each = state(angle_deg, 0, 1.0)
     found, expected = (
         count_normals([each], {each.state.name: as_map(relief)}, pixel_um=PIXEL_UM)
-        for relief in (clean + noise, clean)
+        for relief in (clean, clean + finest)
     )
-    added = noise_variances(
-        (clean + noise).astype(np.float32),
-        np.full(clean.shape, slope_noise, np.float32),
+    added = lost_variances(
+        clean.astype(np.float32),
+        np.full(clean.shape, slope_error, np.float32),
         pixel_um=PIXEL_UM,
         valid=np.ones(clean.shape, bool),
         angle_rad=each.state.angle_rad,
     )
     truth = expected[each.state.name]
     errors = []
-    for by_noise in (added, (slope_noise, slope_noise)):
-        (row,) = histogram_document([each], found, None, {each.state.name: by_noise})["states"]
-        values = row["variance_s"], row["variance_t"]
+    for lost in (added, (slope_error, slope_error)):
+        (row,) = histogram_document([each], found, {each.state.name: lost})["states"]
+        values = (row[f"variance_{axis}"] / UNRESOLVED_VARIANCE for axis in "st")
         truths = truth.variance_x, truth.variance_y
         errors.append([abs(v / t - 1.0) for v, t in zip(values, truths, strict=True)])
     assert max(errors[0]) < 0.03, errors
