@@ -14,6 +14,7 @@ from reconstruction.gradient_normals.occlusion import (
     HORIZON_SOFTNESS_RAD,
     HORIZON_STEP_RATIO,
     SOLVER_STEPS,
+    SOLVER_TOLERANCE,
     correct_occlusion,
 )
 from reconstruction.gradient_normals.sphere_lights import (
@@ -89,7 +90,10 @@ def plain_place(relief, row, column, lights):
     first = disc_from_normal(normals_of(relief)[row, column])
     place = first
     for _ in range(SOLVER_STEPS):
-        place = place + observed(first, 1.0) - observed(place, np.clip(free, 0.0, 1.0))
+        step = observed(first, 1.0) - observed(place, np.clip(free, 0.0, 1.0))
+        place = place + step
+        if np.linalg.norm(step) < SOLVER_TOLERANCE:
+            break
     return place
 
 
