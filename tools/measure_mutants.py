@@ -56,6 +56,8 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "tests/protocol/test_wire.py",
             "tests/protocol/test_port.py",
+            "tests/protocol/test_port_bounds.py",
+            "tests/protocol/test_shared_commands.py",
             "tests/protocol/test_flash_driver.py",
             "tests/protocol/test_dome_driver.py",
             "tests/protocol/test_caliper_driver.py",
