@@ -15,6 +15,7 @@ import csv
 import hashlib
 import math
 import os
+import resource
 import signal
 import sys
 import threading
@@ -77,6 +78,9 @@ OTHER_OPERATOR = {
 }
 TIME_FACTOR = 10.0
 MIN_LIMIT_S = 20.0
+PROCESSOR_FACTOR = 3.0
+MIN_PROCESSOR_S = 10.0
+"""A loop without an end ends by processor time, which a busy machine does not lengthen."""
 NORMAL_QUANTILE = 1.96
 UNCHANGED = 71
 """Exit code of a child whose mutant changes no function of its module."""
@@ -207,6 +211,7 @@ class Reach:
         self.paths = {str(ROOT / file): file for file in files}
         self.tests: dict[tuple[str, int], set[str]] = defaultdict(set)
         self.seconds: dict[str, float] = {}
+        self.processor_s: dict[str, float] = {}
         self.test = ""
 
     def _note(self, frame, event, _) -> None:
@@ -216,7 +221,7 @@ class Reach:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item, nextitem):
-        self.test, begun_s = item.nodeid, time.perf_counter()
+        self.test, begun_s, used_s = item.nodeid, time.perf_counter(), time.process_time()
         sys.setprofile(self._note)
         threading.setprofile(self._note)
         try:
@@ -225,6 +230,7 @@ class Reach:
             sys.setprofile(None)
             threading.setprofile(None)
             self.seconds[item.nodeid] = time.perf_counter() - begun_s
+            self.processor_s[item.nodeid] = time.process_time() - used_s
 
 
 def run_tests(tests, plugins=()) -> int:
@@ -238,7 +244,10 @@ def run_tests(tests, plugins=()) -> int:
 
 
 def judge(mutant: Mutant, reach: Reach) -> str:
-    """Return "killed", "survived", "not reached" or "late" of a mutant, by a child process."""
+    """Return "killed", "survived", "not reached" or "late" of a mutant, by a child process.
+
+    A late one has used several times the processor time of its tests, or waits for ever.
+    """
     tests = set().union(*(reach.tests[mutant.file, line] for line in mutant.functions))
     if not tests:
         return "not reached"
@@ -246,6 +255,9 @@ def judge(mutant: Mutant, reach: Reach) -> str:
     child = os.fork()
     if child == 0:
         os.setsid()
+        allowed_s = MIN_PROCESSOR_S + PROCESSOR_FACTOR * sum(map(reach.processor_s.get, ordered))
+        spent_s = math.ceil(time.process_time() + allowed_s)
+        resource.setrlimit(resource.RLIMIT_CPU, (spent_s, spent_s + 1))
         code = 70
         try:
             with planted(mutant.file, mutate_tree(mutant)) as changed:
@@ -260,7 +272,8 @@ def judge(mutant: Mutant, reach: Reach) -> str:
             return "late"
         time.sleep(0.02)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    return {0: "survived", UNCHANGED: "no function"}.get(code, "killed")
+    outcomes = {0: "survived", UNCHANGED: "no function", -signal.SIGXCPU: "late"}
+    return outcomes.get(code, "killed")
 
 
 def read_table() -> list[dict[str, str]]:

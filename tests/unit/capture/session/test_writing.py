@@ -15,7 +15,7 @@ from fixtures.small_sessions import (
     encode_frame,
 )
 
-from capture.session import Session, SessionError, SessionLocked, reopen_copy, verify
+from capture.session import Session, SessionDamage, SessionError, SessionLocked, reopen_copy, verify
 from capture.session.reopening import resume_unless_complete
 
 
@@ -127,8 +127,9 @@ def test_impossible_omission_is_named_by_field(session):
     for steps in ([], ["S000", "S000"]):
         with pytest.raises(SessionError, match=r"step_ids: .* expected at least one, none twice"):
             session.omit_steps(steps, reason="blinked", **words)
-    with pytest.raises(SessionError, match="reason: got ' ', expected a text"):
+    with pytest.raises(SessionError, match="reason: got ' ', expected a text") as caught:
         session.omit_steps(["S000"], reason=" ", **words)
+    assert not isinstance(caught.value, SessionDamage)  # the caller is wrong, not the session
     session.omit_steps(["S000"], reason="blinked", about={"x": 1}, t_host_s=2)
     for opened in (session, Session.open(session.path)):
         line = opened.omission_line("S000")
