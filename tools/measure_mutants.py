@@ -244,14 +244,23 @@ def run_tests(tests, plugins=()) -> int:
 
 
 def judge(mutant: Mutant, reach: Reach) -> str:
-    """Return "killed", "survived", "not reached" or "late" of a mutant, by a child process.
+    """Return "killed", "survived", "not reached", "late" or "no function" of a mutant.
 
-    A late one has used several times the processor time of its tests, or waits for ever.
+    A late one has used several times the processor time of its tests, or has waited too long in
+    two children: one alone may be locked by a thread of this process that the fork has lost.
     """
     tests = set().union(*(reach.tests[mutant.file, line] for line in mutant.functions))
     if not tests:
         return "not reached"
     ordered = sorted(tests, key=lambda test: reach.seconds[test])
+    code = run_child(mutant, ordered, reach)
+    code = run_child(mutant, ordered, reach) if code == -signal.SIGKILL else code
+    outcomes = {0: "survived", UNCHANGED: "no function"}
+    return outcomes.get(code, "late" if code in (-signal.SIGXCPU, -signal.SIGKILL) else "killed")
+
+
+def run_child(mutant: Mutant, ordered: list[str], reach: Reach) -> int:
+    """Return the exit code of the tests of a mutant, in a process of their own."""
     child = os.fork()
     if child == 0:
         os.setsid()
@@ -268,12 +277,8 @@ def judge(mutant: Mutant, reach: Reach) -> str:
     while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
         if time.monotonic() > last_s:
             os.killpg(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "late"
         time.sleep(0.02)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    outcomes = {0: "survived", UNCHANGED: "no function", -signal.SIGXCPU: "late"}
-    return outcomes.get(code, "killed")
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def read_table() -> list[dict[str, str]]:

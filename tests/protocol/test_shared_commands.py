@@ -323,6 +323,19 @@ def test_sequence_is_armed_run_and_read(make_box):
     assert (box.step_time(3), box.step_time(4), box.lost_events) == (2.5, None, 3)
 
 
+def test_releases_are_heard_while_lease_is_renewed(make_box, monkeypatch):
+    """Rows and times in digits; anything else is no release."""
+    payloads = ["0,1500000", "12,2000000", "x,5", "3,y", "4", "-1,7"]
+    heard = [[wire.Event(n, 1, "SEQ:STEP", one) for n, one in enumerate(payloads)]]
+    heard += [[], [wire.Event(9, 1, "SEQ:STOP", "5,6"), wire.Event(10, 1, "SEQ:STEP", "13,1")]]
+    box = make_box(*[("SYST:PING?", "1")] * 3, driver=PlainLedBox)
+    waits = []
+    monkeypatch.setattr(box.port, "listen", lambda span_s: waits.append(span_s) or heard.pop(0))
+    assert box.listen(0.25) == {0: 1.5, 12: 2.0, 13: 1e-6}
+    assert waits == pytest.approx([0.1, 0.1, 0.05])
+    assert box.listen(0.0) == {}
+
+
 @pytest.mark.parametrize(
     ("call", "text", "payload", "expected"),
     [
