@@ -1,10 +1,10 @@
 """Mutate functions of a group of modules, run the tests that reach them, and print the score.
 
 One operator, number or statement is changed at a time, in a child of a process that has loaded the
-tests. The mutants are drawn by a seed, without those that other seeds have
-drawn. Outcomes go to tools/mutants.csv as they are found, and another run continues there; a mutant
-of a changed line runs again. Survivors keep the reason in the column `why` that a person has
-written.
+tests; those on real lines are left out. The mutants are drawn by a seed, without those that other
+seeds have drawn. Outcomes go to tools/mutants.csv as they are found, and another run continues
+there; a mutant of a changed line runs again. Survivors keep the reason in the column `why` that a
+person has written.
 
 python tools/measure_mutants.py --groups session,lines,rules --count 60 --seed 4 [--budget 600]
 """
@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 from fixtures.planted import planted  # noqa: E402
+from real_time import is_on_a_real_line  # noqa: E402
 
 TABLE = ROOT / "tools/mutants.csv"
 COLUMNS = ("group", "file", "line", "column", "change", "hash", "seed", "outcome", "why")
@@ -213,11 +214,16 @@ class Reach:
         self.seconds: dict[str, float] = {}
         self.processor_s: dict[str, float] = {}
         self.test = ""
+        self.failed = ""
 
     def _note(self, frame, event, _) -> None:
         if event == "call" and frame.f_code.co_filename in self.paths:
             file = self.paths[frame.f_code.co_filename]
             self.tests[file, frame.f_code.co_firstlineno].add(self.test)
+
+    def pytest_runtest_logreport(self, report) -> None:
+        if report.failed:
+            self.failed = report.nodeid
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item, nextitem):
@@ -233,6 +239,13 @@ class Reach:
             self.processor_s[item.nodeid] = time.process_time() - used_s
 
 
+class SimulatedLines:
+    """Plugin that deselects tests in real time: on a busy machine they would kill any mutant."""
+
+    def pytest_collection_modifyitems(self, items) -> None:
+        items[:] = [item for item in items if not is_on_a_real_line(item)]
+
+
 def run_tests(tests, plugins=()) -> int:
     """Run tests in this process, without output."""
     quiet = os.open(os.devnull, os.O_WRONLY)
@@ -240,7 +253,7 @@ def run_tests(tests, plugins=()) -> int:
         os.dup2(quiet, stream)
     arguments = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not long", "--tb=no"]
     arguments += ["--doctest-modules", "--timeout=0"]  # a busy machine kills no mutant
-    return int(pytest.main([*arguments, *tests], plugins=list(plugins)))
+    return int(pytest.main([*arguments, *tests], plugins=[SimulatedLines(), *plugins]))
 
 
 def judge(mutant: Mutant, reach: Reach) -> str:
@@ -372,7 +385,7 @@ def judge_group(group: str, count: int, seed: int, budget_s: float) -> None:
     for number, stream in enumerate(shown, start=1):
         os.dup2(stream, number)
     if code:
-        raise SystemExit(f"{group}: the tests fail without a mutant, exit code {code}")
+        raise SystemExit(f"{group}: {reach.failed or 'pytest'} fails without a mutant, code {code}")
     print(f"  {len(reach.seconds)} tests, {time.monotonic() - begun_s:.0f} s", flush=True)
     for mutant in to_do:
         if time.monotonic() - begun_s > budget_s:

@@ -123,6 +123,21 @@ def test_resuming_cuts_line_then_moves_strays(tmp_path, disk):
     ]
 
 
+def test_dropped_folder_of_orphans_is_made_again(tmp_path, disk):
+    """Mail and archives drop empty folders; resuming named the disk as its cause."""
+    create_session(tmp_path / "s").release()
+    (tmp_path / "s/orphans").rmdir()
+    Session.resume(tmp_path / "s", disk=disk).release()
+    assert disk.take_notes() == [*resumed("s"), "close s/journal.jsonl"]
+    (tmp_path / "s/frames/S000+cam.dng").write_bytes(b"stray")
+    Session.resume(tmp_path / "s", disk=disk).release()
+    assert disk.take_notes() == [
+        *resumed("s"),
+        *("make_dir s/orphans", "fsync_dir s", "rename s/orphans/S000+cam.dng.1"),
+        *("fsync_dir s/orphans", "fsync_dir s/frames", "close s/journal.jsonl"),
+    ]
+
+
 def test_refused_resumption_leaves_no_lock(tmp_path, disk):
     with create_session(tmp_path / "s") as session:
         commit_frame(session, "S000")
