@@ -233,7 +233,7 @@ def test_event_numbers_count_losses_across_zero(open_port):
     assert port.statistics.stale == 2
 
 
-def test_damage_reports_are_no_events(open_port):
+def test_damage_reports_are_not_events(open_port):
     port = open_port(
         (ask(8, "SAFE"), event(0, "NAK")),
         (ask(8, "SAFE", retry=True), event(1, "NAK")),

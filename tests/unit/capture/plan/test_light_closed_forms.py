@@ -195,7 +195,7 @@ def test_pulse_is_spread_over_fusion_time():
     np.testing.assert_allclose(seen, seen[::-1])
 
 
-def test_small_steps_are_no_turns():
+def test_small_steps_are_not_turns():
     """Light that rises and falls in steps of half the change, with dips, turns twice: one flash."""
     rise = np.repeat(np.linspace(0.0, 1.0, 21), 3)
     rise[4::6] -= 0.04
@@ -236,7 +236,7 @@ def test_darkness_has_no_band_but_noise():
     assert band_rms(np.full(5000, 2.0)) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_dim_flash_between_bright_ones_is_counted_from_tenth():
+def test_dim_flash_counts_from_tenth_of_brightest():
     """Flashes of the ninth and of the eleventh part of the brightest light."""
     for part, flashes in ((9.0, 2.0), (11.0, 1.0)):
         levels = (1.0, 0.0, 1.0 / part, 0.0)

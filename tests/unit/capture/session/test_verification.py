@@ -1,4 +1,4 @@
-"""What `verify` reports of a session: each finding in its list, with its figures."""
+"""Findings of `verify`: each in its list, with its figures."""
 
 import threading
 from datetime import UTC, date, datetime, timedelta
