@@ -240,10 +240,18 @@ class Reach:
 
 
 class SimulatedLines:
-    """Plugin that deselects tests in real time: on a busy machine they would kill any mutant."""
+    """Plugin that keeps the given order of tests, and leaves out those in real time.
 
-    def pytest_collection_modifyitems(self, items) -> None:
-        items[:] = [item for item in items if not is_on_a_real_line(item)]
+    On a busy machine, tests in real time would kill any mutant. `tests/conftest.py` sorts files by
+    their length, longest first; here the shortest test kills a mutant soonest.
+    """
+
+    def __init__(self, tests) -> None:
+        self.places = {test: place for place, test in enumerate(tests)}
+
+    def pytest_collection_finish(self, session) -> None:
+        session.items[:] = [item for item in session.items if not is_on_a_real_line(item)]
+        session.items.sort(key=lambda item: self.places.get(item.nodeid, 0))
 
 
 def run_tests(tests, plugins=()) -> int:
@@ -253,21 +261,19 @@ def run_tests(tests, plugins=()) -> int:
         os.dup2(quiet, stream)
     arguments = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not long", "--tb=no"]
     arguments += ["--doctest-modules", "--timeout=0"]  # a busy machine kills no mutant
-    return int(pytest.main([*arguments, *tests], plugins=[SimulatedLines(), *plugins]))
+    return int(pytest.main([*arguments, *tests], plugins=[SimulatedLines(tests), *plugins]))
 
 
 def judge(mutant: Mutant, reach: Reach) -> str:
     """Return "killed", "survived", "not reached", "late" or "no function" of a mutant.
 
-    A late one has used several times the processor time of its tests, or has waited too long in
-    two children: one alone may be locked by a thread of this process that the fork has lost.
+    A late one has used several times the processor time of its tests, or has waited too long.
     """
     tests = set().union(*(reach.tests[mutant.file, line] for line in mutant.functions))
     if not tests:
         return "not reached"
     ordered = sorted(tests, key=lambda test: reach.seconds[test])
     code = run_child(mutant, ordered, reach)
-    code = run_child(mutant, ordered, reach) if code == -signal.SIGKILL else code
     outcomes = {0: "survived", UNCHANGED: "no function"}
     return outcomes.get(code, "late" if code in (-signal.SIGXCPU, -signal.SIGKILL) else "killed")
 
