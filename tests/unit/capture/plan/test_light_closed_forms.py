@@ -167,6 +167,15 @@ def test_light_is_received_by_cosine_to_view():
     assert 0 < np.count_nonzero(found) < len(found)
 
 
+def test_eye_behind_a_light_receives_nothing_from_it():
+    """On its axis, where rounding may carry the cosine below -1."""
+    for number, light in enumerate(DOME.lights[:30]):
+        behind = tuple(2.0 * np.array(light.position_mm))
+        towards = tuple(np.array(light.position_mm) / np.linalg.norm(light.position_mm))
+        for facing in (towards, tuple(-np.array(towards))):
+            assert eye_irradiance(DOME, eyes_mm=[behind], facing=facing)[number] == 0.0
+
+
 @pytest.mark.parametrize(("rig", "eyes_mm"), [(DOME, EYES_MM), (SPHERE, [(0.0, 0.0, 0.0)])])
 def test_default_eyes_are_those_of_rig(rig, eyes_mm):
     np.testing.assert_array_equal(eye_irradiance(rig), eye_irradiance(rig, eyes_mm=eyes_mm))

@@ -173,6 +173,13 @@ def test_line_without_record_is_damage_before_others(spoiled):
     assert (walk.end, walk.torn, len(walk.lines)) == (len(first), 0, 1)
 
 
+@pytest.mark.parametrize("rest", [b"", b"\0\0"])
+def test_newline_at_beginning_is_damage(rest):
+    """An interrupted write leaves the beginning of a line, and no line begins with its end."""
+    walk = walk_journal(b"\n" + rest, seal=SEAL, where="journal")
+    assert (walk.damage is None, walk.torn) == (False, 0)
+
+
 def test_line_of_unknown_kind_is_named():
     """Sealed as it should be, so that its content must be refused."""
     record = canonical_json({"type": "erasure"})
