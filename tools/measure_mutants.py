@@ -1,10 +1,10 @@
 """Mutate functions of a group of modules, run the tests that reach them, and print the score.
 
 One operator, number or statement is changed at a time, in a child of a process that has loaded the
-tests. The mutants are drawn by a seed, without those that other seeds have
-drawn. Outcomes go to tools/mutants.csv as they are found, and another run continues there; a mutant
-of a changed line runs again. Survivors keep the reason in the column `why` that a person has
-written.
+tests; those on real lines are left out. The mutants are drawn by a seed, without those that other
+seeds have drawn. Outcomes go to tools/mutants.csv as they are found, and another run continues
+there; a mutant of a changed line runs again. Survivors keep the reason in the column `why` that a
+person has written.
 
 python tools/measure_mutants.py --groups session,lines,rules --count 60 --seed 4 [--budget 600]
 """
@@ -15,6 +15,7 @@ import csv
 import hashlib
 import math
 import os
+import resource
 import signal
 import sys
 import threading
@@ -32,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 from fixtures.planted import planted  # noqa: E402
+from real_time import is_on_a_real_line  # noqa: E402
 
 TABLE = ROOT / "tools/mutants.csv"
 COLUMNS = ("group", "file", "line", "column", "change", "hash", "seed", "outcome", "why")
@@ -56,6 +58,8 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "tests/protocol/test_wire.py",
             "tests/protocol/test_port.py",
+            "tests/protocol/test_port_bounds.py",
+            "tests/protocol/test_shared_commands.py",
             "tests/protocol/test_flash_driver.py",
             "tests/protocol/test_dome_driver.py",
             "tests/protocol/test_caliper_driver.py",
@@ -75,6 +79,9 @@ OTHER_OPERATOR = {
 }
 TIME_FACTOR = 10.0
 MIN_LIMIT_S = 20.0
+PROCESSOR_FACTOR = 3.0
+MIN_PROCESSOR_S = 10.0
+"""A loop without an end ends by processor time, which a busy machine does not lengthen."""
 NORMAL_QUANTILE = 1.96
 UNCHANGED = 71
 """Exit code of a child whose mutant changes no function of its module."""
@@ -205,16 +212,22 @@ class Reach:
         self.paths = {str(ROOT / file): file for file in files}
         self.tests: dict[tuple[str, int], set[str]] = defaultdict(set)
         self.seconds: dict[str, float] = {}
+        self.processor_s: dict[str, float] = {}
         self.test = ""
+        self.failed = ""
 
     def _note(self, frame, event, _) -> None:
         if event == "call" and frame.f_code.co_filename in self.paths:
             file = self.paths[frame.f_code.co_filename]
             self.tests[file, frame.f_code.co_firstlineno].add(self.test)
 
+    def pytest_runtest_logreport(self, report) -> None:
+        if report.failed:
+            self.failed = report.nodeid
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item, nextitem):
-        self.test, begun_s = item.nodeid, time.perf_counter()
+        self.test, begun_s, used_s = item.nodeid, time.perf_counter(), time.process_time()
         sys.setprofile(self._note)
         threading.setprofile(self._note)
         try:
@@ -223,6 +236,22 @@ class Reach:
             sys.setprofile(None)
             threading.setprofile(None)
             self.seconds[item.nodeid] = time.perf_counter() - begun_s
+            self.processor_s[item.nodeid] = time.process_time() - used_s
+
+
+class SimulatedLines:
+    """Plugin that keeps the given order of tests, and leaves out those in real time.
+
+    On a busy machine, tests in real time would kill any mutant. `tests/conftest.py` sorts files by
+    their length, longest first; here the shortest test kills a mutant soonest.
+    """
+
+    def __init__(self, tests) -> None:
+        self.places = {test: place for place, test in enumerate(tests)}
+
+    def pytest_collection_finish(self, session) -> None:
+        session.items[:] = [item for item in session.items if not is_on_a_real_line(item)]
+        session.items.sort(key=lambda item: self.places.get(item.nodeid, 0))
 
 
 def run_tests(tests, plugins=()) -> int:
@@ -232,18 +261,31 @@ def run_tests(tests, plugins=()) -> int:
         os.dup2(quiet, stream)
     arguments = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not long", "--tb=no"]
     arguments += ["--doctest-modules", "--timeout=0"]  # a busy machine kills no mutant
-    return int(pytest.main([*arguments, *tests], plugins=list(plugins)))
+    return int(pytest.main([*arguments, *tests], plugins=[SimulatedLines(tests), *plugins]))
 
 
 def judge(mutant: Mutant, reach: Reach) -> str:
-    """Return "killed", "survived", "not reached" or "late" of a mutant, by a child process."""
+    """Return "killed", "survived", "not reached", "late" or "no function" of a mutant.
+
+    A late one has used several times the processor time of its tests, or has waited too long.
+    """
     tests = set().union(*(reach.tests[mutant.file, line] for line in mutant.functions))
     if not tests:
         return "not reached"
     ordered = sorted(tests, key=lambda test: reach.seconds[test])
+    code = run_child(mutant, ordered, reach)
+    outcomes = {0: "survived", UNCHANGED: "no function"}
+    return outcomes.get(code, "late" if code in (-signal.SIGXCPU, -signal.SIGKILL) else "killed")
+
+
+def run_child(mutant: Mutant, ordered: list[str], reach: Reach) -> int:
+    """Return the exit code of the tests of a mutant, in a process of their own."""
     child = os.fork()
     if child == 0:
         os.setsid()
+        allowed_s = MIN_PROCESSOR_S + PROCESSOR_FACTOR * sum(map(reach.processor_s.get, ordered))
+        spent_s = math.ceil(time.process_time() + allowed_s)
+        resource.setrlimit(resource.RLIMIT_CPU, (spent_s, spent_s + 1))
         code = 70
         try:
             with planted(mutant.file, mutate_tree(mutant)) as changed:
@@ -254,11 +296,8 @@ def judge(mutant: Mutant, reach: Reach) -> str:
     while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
         if time.monotonic() > last_s:
             os.killpg(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "late"
         time.sleep(0.02)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    return {0: "survived", UNCHANGED: "no function"}.get(code, "killed")
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def read_table() -> list[dict[str, str]]:
@@ -352,7 +391,7 @@ def judge_group(group: str, count: int, seed: int, budget_s: float) -> None:
     for number, stream in enumerate(shown, start=1):
         os.dup2(stream, number)
     if code:
-        raise SystemExit(f"{group}: the tests fail without a mutant, exit code {code}")
+        raise SystemExit(f"{group}: {reach.failed or 'pytest'} fails without a mutant, code {code}")
     print(f"  {len(reach.seconds)} tests, {time.monotonic() - begun_s:.0f} s", flush=True)
     for mutant in to_do:
         if time.monotonic() - begun_s > budget_s:

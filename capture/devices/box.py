@@ -275,5 +275,6 @@ def format_decimal(field: str, value: float, digits: int) -> str:
     """
     if not math.isfinite(value):
         raise ValueError(f"{field}: got {value}, expected a finite number")
-    text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
+    text = f"{value:.{digits}f}"
+    text = text.rstrip("0").rstrip(".") if digits else text  # else 100 loses its zeros
+    return "0" if text == "-0" else text

@@ -334,8 +334,6 @@ class Port:
                 f"cannot open {self.url}: {reason}; "
                 f"{opening_advice(self.url, kind, number)} [SR-CAP-001]"
             ) from exc
-        self._splitter.clear()
-        self._lines.clear()
 
     @contextlib.contextmanager
     def _translate_errors(self, action: str) -> Iterator[None]:

@@ -108,16 +108,19 @@ def read_file(
             raise missing() from exc
         got = "a symbolic link" if path.is_symlink() else str(exc.strerror)
         raise _damage_error(path, label, got, "a file") from exc
-    with open(descriptor, "rb") as file:
+    try:
         state = os.fstat(descriptor)
         if not stat.S_ISREG(state.st_mode):
             raise _damage_error(path, label, "not a plain file", "a file")
         if state.st_size > limit:
             raise _damage_error(path, label, f"{state.st_size} bytes", f"at most {limit}")
         try:
-            return file.read()
+            with open(descriptor, "rb", closefd=False) as file:
+                return file.read()
         except OSError as exc:
             raise _damage_error(path, label, str(exc.strerror), "a readable file") from exc
+    finally:
+        os.close(descriptor)
 
 
 def _damage_error(path: Path, label: str, got: str, expected: str) -> SessionDamage:

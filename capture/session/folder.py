@@ -194,6 +194,9 @@ def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
             )
     if not orphans:
         return
+    if not (path / ORPHANS_FOLDER).is_dir():  # mail and archives drop empty folders
+        disk.make_dir(path / ORPHANS_FOLDER)
+        disk.fsync_dir(path)
     taken = set(os.listdir(path / ORPHANS_FOLDER))
     for file in orphans:
         name, number = Path(file).name, 1

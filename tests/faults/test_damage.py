@@ -325,6 +325,15 @@ BROKEN = {
         lambda p: (frame(p).unlink(), os.mkfifo(frame(p))),
         "not a plain file",
     ),
+    "frame that is a folder": (lambda p: (frame(p).unlink(), frame(p).mkdir()), "not a plain file"),
+    "manifest that is a folder": (
+        lambda p: ((p / "session.json").unlink(), (p / "session.json").mkdir()),
+        "not a plain file",
+    ),
+    "journal that is a folder": (
+        lambda p: ((p / "journal.jsonl").unlink(), (p / "journal.jsonl").mkdir()),
+        "not a plain file",
+    ),
     "frames swapped": (swap_two_frames, "S001+cam.dng"),
     "frames folder that is a link": (link_the_folder, "a folder, not a link"),
 }

@@ -12,6 +12,7 @@ import pytest
 import serial
 from fixtures.compiled.sides import choose_side, leave_real_lines_to_one_side, on_both_sides
 from fixtures.quick_close import quick_close
+from fixtures.scripted_line import open_port
 from serial import rfc2217
 
 from capture.devices.camera import open_camera
@@ -23,7 +24,7 @@ from rigsim.world import World
 from rigsim.world.rig_boxes import BOXES
 from rigsim.world.serve import serve_world
 
-__all__ = ["quick_close"]
+__all__ = ["open_port", "quick_close"]
 NAMES = (f"protocol-{number}" for number in itertools.count())
 
 EMULATED_ONLY = {

@@ -5,10 +5,10 @@ import importlib.metadata
 import sys
 import termios
 import threading
-from collections import deque
 
 import pytest
 import serial
+from fixtures.scripted_line import HELLO, Line, StillClock, ask, greet, say
 
 from capture.devices.port import (
     BadAnswer,
@@ -22,85 +22,6 @@ from capture.devices.port import (
     WrongDevice,
 )
 from capture.devices.wire import Event, Reply, Request, encode
-
-HELLO = "1,flash,FL-0001,1.0"
-
-
-class Line:
-    """A serial port that expects writes and plays what comes back after each."""
-
-    def __init__(self, script, **kwargs):
-        self.script = deque(script)
-        self.options = kwargs
-        self.arrived = bytearray()
-        self.closed = False
-
-    def write(self, data):
-        expected, answer = self.script.popleft()
-        assert data == expected
-        if isinstance(answer, BaseException):
-            raise answer
-        self.arrived += answer
-
-    @property
-    def in_waiting(self):
-        return len(self.arrived)
-
-    def read(self, size):
-        data = bytes(self.arrived[:size])
-        del self.arrived[:size]
-        return data
-
-    def reset_input_buffer(self):
-        self.arrived.clear()
-
-    def close(self):
-        self.closed = True
-
-
-class StillClock:
-    """A clock that a port cannot use: only silence on the line counts."""
-
-    def monotonic(self):
-        return 0.0
-
-    def sleep(self, seconds):
-        raise AssertionError
-
-
-@pytest.fixture
-def open_port(monkeypatch):
-    lines = []
-
-    def open_port(*script, first_seq=7, boot=0x9F3A, **kwargs):
-        greeting = (
-            b"\n" + encode(Request(first_seq, 0, "SYST:HELLO?")),
-            encode(Reply(first_seq, boot, 0, HELLO)),
-        )
-        line = Line([greeting, *script])
-
-        def serial_for_url(url, **options):
-            line.options = options
-            return line
-
-        monkeypatch.setattr(serial, "serial_for_url", serial_for_url)
-        port = Port("/dev/box", clock=StillClock(), first_seq=first_seq, retries=2, **kwargs)
-        port.line = line
-        port.hello()
-        lines.append(line)
-        return port
-
-    yield open_port
-    for line in lines:
-        assert not line.script, "the exchange was not finished"
-
-
-def ask(seq, text, *, boot=0x9F3A, retry=False):
-    return (b"\n" if retry else b"") + encode(Request(seq, boot, text))
-
-
-def say(seq, payload="", *, boot=0x9F3A, code=0):
-    return encode(Reply(seq, boot, code, payload))
 
 
 def test_hello_after_newline_learns_the_epoch(open_port):
@@ -353,10 +274,6 @@ def test_port_without_retries_asks_once(monkeypatch):
     with pytest.raises(PortTimeout):
         port.ask("STAT?")
     assert port.statistics.frames == 1
-
-
-def greet(seq):
-    return (b"\n" + encode(Request(seq, 0, "SYST:HELLO?")), encode(Reply(seq, 0x9F3A, 0, HELLO)))
 
 
 def test_hello_forgets_half_a_line(open_port):

@@ -194,3 +194,89 @@ def test_half_of_all_numbers_is_behind():
             assert not wire.is_behind((latest + ahead) % 2**32, latest)
         for behind in (1, 2**31 - 1, 2**31):
             assert wire.is_behind((latest - behind) % 2**32, latest)
+
+
+@pytest.mark.parametrize(
+    ("kind", "good"),
+    [
+        (Request, {"seq": 0, "boot": 0, "text": "STAT?"}),
+        (Reply, {"seq": 2**32 - 1, "boot": 0xFFFF, "code": 0, "payload": "x"}),
+        (Event, {"number": 0, "boot": 1, "name": "NAK", "payload": "x"}),
+    ],
+)
+def test_each_frame_checks_each_field(kind, good):
+    """Also frames that no line has brought, so that none is sent that decoding refuses."""
+    frame = kind(**good)
+    assert decode(encode(frame)[:-1]) == frame
+    number, text = next(iter(good)), list(good)[-1]
+    wrong = [(number, 2**32), (number, -1), ("boot", 0x10000), ("boot", -1)]
+    for field, value in [*wrong, (text, "\x1f"), (text, "\x7f"), (text, "a\xe9")]:
+        with pytest.raises(ValueError, match=f"^{field}: got "):
+            kind(**good | {field: value})
+    assert kind(**good | {text: " ~"})
+
+
+def test_line_without_end_is_shorter_than_limit():
+    """With its newline it has 1024 bytes; one byte more is refused before it is decoded."""
+    for size, refused in ((wire.MAX_LINE_BYTES - 1, False), (wire.MAX_LINE_BYTES, True)):
+        text = "@1:0001 "
+        line = wire.seal(text + "x" * (size - len(text) - 5)).encode()
+        assert len(line) == size
+        if refused:
+            with pytest.raises(BadFrame, match="line: got 1024 bytes, expected fewer than 1024"):
+                decode(line)
+        else:
+            assert decode(line).seq == 1
+
+
+@pytest.mark.parametrize("byte", [0x00, 0x0A, 0x1F, 0x7F, 0x80, 0xFF])
+def test_byte_outside_ascii_is_named_before_checksum(byte):
+    with pytest.raises(BadFrame, match="line: got a byte outside printable ASCII"):
+        decode(b"@17:9f3a FLAS" + bytes([byte]) + b"*0000")
+
+
+@pytest.mark.parametrize(
+    ("sealed", "text"),
+    [
+        ("SAFE", "checksum: got 'SAFE' at the end, expected"),
+        ("SAFE*12G4", r"checksum: got '\*12G4' at the end, expected"),
+        ("*IDN?*0000", "checksum: got 0000, expected "),
+        ("caf\xe9*0000", "checksum: got 0000, expected "),
+    ],
+)
+def test_broken_seal_is_named(sealed, text):
+    with pytest.raises(BadFrame, match=text):
+        wire.unseal(sealed)
+    assert wire.unseal(wire.seal("*IDN?")) == "*IDN?"
+
+
+@pytest.mark.parametrize(("begun", "overlong"), [(b"*ID", 0), (b"x" * 2000, 1)])
+def test_cleared_splitter_begins_a_line(begun, overlong):
+    splitter = wire.LineSplitter()
+    assert splitter.feed(begun) == []
+    splitter.clear()
+    assert splitter.feed(b"STAT?\n") == [b"STAT?"]
+    assert splitter.overlong_lines == overlong
+
+
+def test_overlong_lines_are_counted_one_by_one():
+    splitter = wire.LineSplitter()
+    assert splitter.overlong_lines == 0
+    assert splitter.feed(b"x" * 1023 + b"\n" + b"x" * 1024 + b"\n*IDN?\n") == [
+        b"x" * 1023,
+        b"*IDN?",
+    ]
+    for _ in range(3):
+        assert splitter.feed(b"y" * 700) == []
+    assert splitter.feed(b"\n\r\n\nSTAT?\r\n") == [b"STAT?"]
+    assert splitter.overlong_lines == 2
+
+
+def test_frame_without_text_after_head_is_refused():
+    for body in ("=1:0001 ", "!1:0001 ", "=1:0001 -", "!1:0001 9A", "=1:0001 5x"):
+        with pytest.raises(BadFrame, match="after seq:boot, expected a code or a name"):
+            decode(wire.seal(body).encode())
+    with pytest.raises(BadFrame, match="expected '@', '=' or '!', seq:boot and a text"):
+        decode(wire.seal("#1:0001 x").encode())
+    with pytest.raises(BadFrame, match="text: got '', expected a command"):
+        decode(wire.seal("@1:0001 ").encode())

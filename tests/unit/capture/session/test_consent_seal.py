@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import hashlib
 import json
 import os
 import re
@@ -33,6 +34,7 @@ from capture.session.consent_seal import (
     SEALED_STATE,
     UNCHECKED_STATE,
     UNSEALED_STATE,
+    make_seal,
     read_key,
 )
 from capture.session.contents import read_contents
@@ -222,6 +224,40 @@ def test_unfit_key_is_refused_before_a_session(
     with pytest.raises(SessionError, match=fault or "No such file"):
         make_session()
     assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("size", [31, 32, 4096, 4097])
+def test_key_has_bytes_within_its_bounds(key, size):
+    key.write_bytes(bytes(size))
+    if size in (32, 4096):
+        assert read_key() == bytes(size)
+    else:
+        fault = f"got {size} bytes, expected a file of 32 to 4096 bytes"
+        with pytest.raises(SessionError, match=fault) as caught:
+            read_key()
+        assert "[SR-SES-015]" in str(caught.value)
+
+
+@pytest.mark.parametrize("bit", range(9))
+def test_key_is_open_to_its_owner_alone(key, bit):
+    """Each permission of others refuses it; those of its owner do not."""
+    mode = 0o400 | 1 << bit
+    key.chmod(mode)
+    if mode & 0o700 == mode:
+        assert len(read_key()) == 32
+    else:
+        with pytest.raises(SessionError, match=f"got mode {mode:o}, expected mode 600"):
+            read_key()
+
+
+def test_seal_is_hash_of_key_and_manifest():
+    """RFC 2104 by hand, for a key shorter than a block and one longer."""
+    for key in (bytes(range(32)), bytes(range(200))):
+        block = (key if len(key) <= 64 else hashlib.sha256(key).digest()).ljust(64, b"\0")
+        inner, outer = (bytes(one ^ pad for one in block) for pad in (0x36, 0x5C))
+        content = b"skinrig.consent-seal/1\n" + b"{}"
+        code = hashlib.sha256(outer + hashlib.sha256(inner + content).digest()).hexdigest()
+        assert make_seal(b"{}", key) == code.encode() + b"\n"
 
 
 def test_key_command_is_quoted_and_for_missing_file(tmp_path, monkeypatch):

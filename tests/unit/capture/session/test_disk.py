@@ -4,7 +4,9 @@
 `tests/faults/test_power_cut.py`; here the calls to the operating system themselves are seen.
 """
 
+import contextlib
 import os
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 from capture import raw
 from capture.calibration import store as calibration_store
 from capture.session.disk import Disk, read_file
-from capture.session.errors import SessionDamage
+from capture.session.errors import SessionDamage, SessionError
 
 
 @pytest.fixture
@@ -108,3 +110,114 @@ def test_pipe_is_refused_as_file(tmp_path):
 def test_file_that_cannot_be_read_is_damage():
     with pytest.raises(SessionDamage, match="expected a readable file"):
         read_file(Path("/proc/self/mem"), limit=5, label="memory")
+
+
+def test_short_writes_continue_until_all_is_written(tmp_path, monkeypatch):
+    """A full or slow medium may take a part of a call's bytes."""
+    taken, write = [], os.write
+
+    def write_little(descriptor, data):
+        taken.append(write(descriptor, data[:3]))
+        return taken[-1]
+
+    monkeypatch.setattr(os, "write", write_little)
+    disk = Disk()
+    descriptor = disk.create(tmp_path / "frame")
+    disk.write(descriptor, b"skin light")
+    disk.close(descriptor)
+    assert taken == [3, 3, 3, 1]
+    assert (tmp_path / "frame").read_bytes() == b"skin light"
+
+
+@pytest.mark.parametrize("opening", ["create", "open_append", "open_update"])
+def test_writing_follows_no_link(tmp_path, opening):
+    (tmp_path / "elsewhere").write_bytes(b"kept")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="link"):
+        getattr(Disk(), opening)(tmp_path / "link")
+    assert (tmp_path / "elsewhere").read_bytes() == b"kept"
+
+
+def test_existing_file_is_never_created_again(tmp_path):
+    (tmp_path / "frame").write_bytes(b"kept")
+    with pytest.raises(FileExistsError):
+        Disk().create(tmp_path / "frame")
+    with pytest.raises(FileNotFoundError):
+        Disk().open_append(tmp_path / "none")
+    assert (tmp_path / "frame").read_bytes() == b"kept"
+    assert not (tmp_path / "none").exists()
+
+
+def test_updated_file_is_its_owners_alone(tmp_path):
+    disk, before = Disk(), os.umask(0)
+    try:
+        disk.close(disk.open_update(tmp_path / "index"))
+        disk.make_dir(tmp_path / "folder")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "index").stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o700
+    descriptor = disk.open_update(tmp_path / "index")
+    disk.write(descriptor, b"12345")
+    disk.truncate(descriptor, 3)
+    assert os.pread(descriptor, 9, 0) == b"123"
+    disk.close(descriptor)
+
+
+def test_renamed_and_removed_files_are_gone(tmp_path):
+    (tmp_path / "old").write_bytes(b"light")
+    Disk().rename(tmp_path / "old", tmp_path / "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    Disk().remove(tmp_path / "new")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shared_locks_exclude_writer_alone(tmp_path):
+    disk = Disk()
+    disk.close(disk.create(tmp_path / "journal"))
+    first, second, writer = (disk.open_append(tmp_path / "journal") for _ in range(3))
+    assert [disk.lock(one, shared=True) for one in (first, second)] == [True, True]
+    assert disk.lock(writer) is False
+    for descriptor in (first, second, writer):
+        disk.close(descriptor)
+
+
+@pytest.mark.parametrize(
+    ("kind", "got"),
+    [("none", "No such file or directory"), ("link", "a symbolic link"), ("folder", "not a plain")],
+)
+def test_unreadable_place_is_named_with_finding(tmp_path, kind, got):
+    (tmp_path / "link").symlink_to(tmp_path / "none")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(SessionDamage, match=rf"{kind}: cannot be read\n  frame: got {got}"):
+        read_file(tmp_path / kind, limit=5, label="frame")
+
+
+@pytest.mark.parametrize("kind", ["sound", "folder", "long"])
+def test_read_file_is_closed_again(tmp_path, kind, monkeypatch):
+    opened, open_file = [], os.open
+
+    def open_noted(*args, **named):
+        opened.append(open_file(*args, **named))
+        return opened[-1]
+
+    (tmp_path / "sound").write_bytes(b"12345")
+    (tmp_path / "long").write_bytes(b"123456")
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr(os, "open", open_noted)
+    with contextlib.suppress(SessionDamage):
+        read_file(tmp_path / kind, limit=5, label="frame")
+    (descriptor,) = opened
+    with pytest.raises(OSError, match="descriptor"):
+        os.fstat(descriptor)
+
+
+def test_missing_file_alone_raises_given_error(tmp_path):
+    """A link or a folder in its place is damage, whatever the caller makes of a missing file."""
+    words = {"limit": 5, "label": "frame", "missing": lambda: SessionError("not there")}
+    with pytest.raises(SessionError, match="not there") as caught:
+        read_file(tmp_path / "none", **words)
+    assert not isinstance(caught.value, SessionDamage)
+    (tmp_path / "link").symlink_to(tmp_path / "none")
+    with pytest.raises(SessionDamage, match="a symbolic link"):
+        read_file(tmp_path / "link", **words)
