@@ -8,7 +8,7 @@ filters (a wave of the cut-off's length keeps half its height).
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,8 @@ MAX_SOURCE_PX = 150_000_000
 """Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
 
 
+SPLIT_UM: Final = 1000.0
+"""Longest period of relief; longer waves belong to the mesh (Nagano2015, section 4)."""
 MAX_HEIGHT_UM = 1e30
 """Larger heights overflow sums in single precision."""
 
@@ -34,7 +36,7 @@ def level_patch(
     *,
     pixel_um: float,
     valid: ArrayLike | None = None,
-    cutoff_um: float = 1000.0,
+    cutoff_um: float = SPLIT_UM,
 ) -> Float32Array:
     """Remove a patch's bulge and tilt: all waves longer than a cut-off.
 

@@ -35,7 +35,10 @@ MIN_PERIODS: Final = 2.0
 """Side of a window over the longest period of a judged octave, at least."""
 PERIOD_TOL: Final = 1.01
 """Factor on a window's longest judged period, for sides of whole pixels."""
-MAX_WINDOW_PX: Final = 1024
+MIN_WINDOW_PX: Final = 16
+MAX_WINDOW_PX: Final = 2048
+MAX_TEXEL_ASPECT: Final = 1.25
+"""Longer over shorter side of the texels in a judged window, at most."""
 
 
 def measure_relief(
@@ -151,10 +154,10 @@ def _compare_spectra(
     height: Any, atlas: Atlas, patches: list[tuple[Any, float]], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Return the RMS amplitude of the map's octaves over that of the patches."""
-    target, target_error, target_count = _mean_octaves(
-        [window for patch, pixel_um in patches for window in _split_patch(patch, pixel_um)]
-    )
-    own, own_error, count = _mean_octaves(_draw_windows(height, atlas, rng))
+    windows = [window for patch, pixel_um in patches for window in _split_patch(patch, pixel_um)]
+    side_um = min(float(np.sqrt(one.size * np.prod(pixel))) for one, pixel in windows)
+    target, target_error, target_count = mean_octaves(windows)
+    own, own_error, count = mean_octaves(draw_windows(height, atlas, rng, side_um))
     return [
         {
             "longest_um": longest,
@@ -183,39 +186,47 @@ def _split_patch(patch: Any, pixel_um: float) -> list[tuple[Float64Array, tuple[
     ]
 
 
-def _draw_windows(
-    height: Any, atlas: Atlas, rng: np.random.Generator
+def draw_windows(
+    height: Any, atlas: Atlas, rng: np.random.Generator, side_um: float
 ) -> list[tuple[Float64Array, tuple[float, float]]]:
-    """Return disjoint windows within charts and away from seams, with their pixels, um."""
+    """Return disjoint windows within charts and away from seams, with their pixels, um.
+
+    All have the patches' side on the skin, since a window smears steep spectra by its side. Texels
+    that are not square are omitted, since synthesis does not correct for them.
+    """
     side = len(height)
-    along_u, along_v = atlas.texel_mm()
-    texel_um = 1e3 * atlas.typical_texel_mm() * atlas.size / side
-    wanted = 1.25 * MIN_PERIODS * PERIODS_UM[0] / texel_um
-    size = int(min(max(wanted, 64.0), MAX_WINDOW_PX, side))
-    margin_mm = 1e-3 * texel_um * size * 0.75 + SEAM_FADE_MM
+    scale = 1e3 * atlas.size / side
+    along_u, along_v = (scale * part for part in atlas.texel_mm())
+    margin_mm = 0.75e-3 * side_um + SEAM_FADE_MM
     inner = ndimage.distance_transform_edt(np.pad(atlas.covered, 1))[1:-1, 1:-1]
     texels = rng.permutation(np.argwhere(inner * atlas.typical_texel_mm() > margin_mm))
-    starts = (texels + 0.5) * side / atlas.size - 0.5 * size
-    starts = np.clip(starts.astype(int), 0, side - size)
-    scale = 1e3 * atlas.size / side
+    row, column = texels.T
+    sizes = np.rint(side_um / np.sqrt(along_u[row, column] * along_v[row, column])).astype(int)
+    aspect = along_u[row, column] / along_v[row, column]
+    kept = (sizes >= MIN_WINDOW_PX) & (sizes <= min(MAX_WINDOW_PX, side))
+    kept &= np.maximum(aspect, 1.0 / aspect) <= MAX_TEXEL_ASPECT
+    texels, sizes = texels[kept], sizes[kept]
+    middles = (texels + 0.5) * side / atlas.size
     found: list[tuple[Float64Array, tuple[float, float]]] = []
-    while len(starts) and len(found) < N_WINDOWS:
-        (top, left), texel = starts[0], tuple(texels[0])
+    while len(sizes) and len(found) < N_WINDOWS:
+        size, texel = int(sizes[0]), tuple(texels[0])
+        top, left = np.clip((middles[0] - 0.5 * size).astype(int), 0, side - size)
         window = np.array(height[top : top + size, left : left + size], np.float64)
-        found.append((window, (scale * float(along_u[texel]), scale * float(along_v[texel]))))
-        apart = np.abs(starts - starts[0]).max(axis=1) >= size
-        texels, starts = texels[apart], starts[apart]
+        found.append((window, (float(along_u[texel]), float(along_v[texel]))))
+        apart = np.abs(middles - middles[0]).max(axis=1) >= 0.5 * (sizes + size) + 1.0
+        texels, sizes, middles = texels[apart], sizes[apart], middles[apart]
     return found
 
 
-def _mean_octaves(
+def mean_octaves(
     windows: list[tuple[Float64Array, tuple[float, float]]],
+    periods_um: tuple[float, ...] = PERIODS_UM,
 ) -> tuple[Float64Array, Float64Array, NDArray[np.intp]]:
     """Return each octave's mean variance, um^2, its relative standard error, and the windows.
 
     The error is that of the mean of independent windows; NaN for fewer than two.
     """
-    found = np.full((len(windows), len(PERIODS_UM) - 1), np.nan)
+    found = np.full((len(windows), len(periods_um) - 1), np.nan)
     for row, (window, (pixel_x, pixel_y)) in zip(found, windows, strict=True):
         rows, columns = window.shape
         weight = np.outer(np.hanning(rows), np.hanning(columns))
@@ -224,12 +235,16 @@ def _mean_octaves(
         per_um = np.hypot(
             np.fft.fftfreq(columns, pixel_x)[None], np.fft.fftfreq(rows, pixel_y)[:, None]
         )
-        least = np.sqrt(rows * pixel_y * columns * pixel_x) / MIN_PERIODS
+        side_um = np.sqrt(rows * pixel_y * columns * pixel_x)
+        least, resolution = side_um / MIN_PERIODS, 1.0 / side_um
         finest = 2.0 * max(pixel_x, pixel_y)
-        for k, (longest, shortest) in enumerate(pairwise(PERIODS_UM)):
+        for k, (longest, shortest) in enumerate(pairwise(periods_um)):
             if longest <= least * PERIOD_TOL and shortest >= finest:
-                band = (per_um >= 1.0 / longest) & (per_um < 1.0 / shortest)
-                row[k] = float(power[band].sum())
+                # a wave at an octave's border counts in both, by the part of its resolution
+                above = per_um + 0.5 * resolution - 1.0 / longest
+                below = 1.0 / shortest - per_um + 0.5 * resolution
+                part = np.clip(np.minimum(above, below) / resolution, 0.0, 1.0)
+                row[k] = float(np.sum(power * part))
     count = np.isfinite(found).sum(axis=0)
     known = np.where(np.isfinite(found), found, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,8 +1,9 @@
-"""Draw the sphere and the pushed patch of Nagano et al. 2015 (figures 5 and 14), with their maps.
+"""Draw sphere, pushed patch and faces of Nagano et al. 2015 (figures 5, 14, 1, 15 and 16).
 
 The sphere has noise in space (top row) and relief grown from a patch (bottom row); it is shrunk,
 grown and squashed. The patch is a block of 25,392 tetrahedra that a probe pushes; its surface is
-shaded with specular reflection and subsurface scattering by the dipole (`model.dipole`).
+shaded with specular reflection and subsurface scattering by the dipole (`model.dipole`). Faces are
+squares of a simulated head in expressions (`skinrig.applying.face_figures`).
 
 References
 ----------
@@ -22,7 +23,6 @@ from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline, griddata
 
 from model import fresnel, store
-from model.dipole import gather as dipole_gather
 from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.fresnel import ETA_SKIN
@@ -33,26 +33,23 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying import microstructure_sphere as spheres
 from skinrig.applying.expression import ApplyError
+from skinrig.applying.face_figures import draw_faces
 from skinrig.applying.microstructure import strain_image
 from skinrig.applying.pushed_patch import BLOCK_DIVISIONS, Push, PushedPatch, SkinBlock, push_block
 from skinrig.applying.relief import level_site_patch
+from skinrig.applying.subsurface_grid import SKIN_COLOR, SKIN_PATH_MM, gather_subsurface
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.atomic_file import write_atomically
 from skinrig.errors import UnusableError, require_choice
 
 SAMPLE_SCHEMA: Final = "skinrig.microstructure-sample/1"
-SAMPLE_SIZES_PX: Final[Mapping[str, int]] = {"sphere": 2048, "patch": 1000}
-"""Side of the displacement maps: pixels of about 10 um."""
+SAMPLE_SIZES_PX: Final[Mapping[str, int]] = {"sphere": 2048, "patch": 1000, "face": 1200}
+"""Side of the displacement maps: pixels of about 10 um; those of a face have 10 um at any size."""
 SIZE_LIMITS_PX: Final = (64, 4096)
-SHADED_CELLS: Final = 125
-"""Side of the grid on which light enters the skin and leaves it: 80 um of a patch of 10 mm."""
 SIMULATED_SITE: Final = "forehead"
-GROWN_PATCH_MM: Final = 3.0
+GROWN_PATCH_MM: Final[Mapping[str, float]] = {"sphere": 3.0, "patch": 3.0, "face": 6.0}
+"""Side of the simulated patch; that of a face is grown over the largest area."""
 NOISE_BAND_PER_MM: Final = (1.0, 25.0)
-SKIN_COLOR: Final = (0.46, 0.31, 0.23)
-"""R_d of red, green and blue light: the mean of simulated faces."""
-SKIN_PATH_MM: Final = (1.84, 1.02, 0.645)
-"""1/sigma_tr of red, green and blue light at the forehead, mm (Weyrich et al. 2005, table 2)."""
 FACET_ROUGHNESS: Final = 0.25
 """GGX roughness of facets below the maps' pixels, 10 um."""
 LIGHT_DIRECTION: Final = (-0.55, 0.45, 0.7)
@@ -83,7 +80,7 @@ class SampleRelief:
     source: str
 
     @staticmethod
-    def simulated(seed: int, size_mm: float = GROWN_PATCH_MM) -> SampleRelief:
+    def simulated(seed: int, size_mm: float) -> SampleRelief:
         """Return simulated skin of the forehead with the paper's table."""
         skin = make_micro_skin(SIMULATED_SITE, seed=seed, size_mm=size_mm)
         source = f"simulated {SIMULATED_SITE}, the paper's table"
@@ -120,12 +117,12 @@ def draw_sample(
     divisions: tuple[int, int, int] = BLOCK_DIVISIONS,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Deform a sphere or a patch with its relief, and write figure, maps and ``sample.json``.
+    """Deform a sample with its relief, and write figures, maps and ``sample.json``.
 
     Parameters
     ----------
     kind
-        "sphere" (figure 5) or "patch" (figure 14).
+        "sphere" (figure 5), "patch" (figure 14) or "face" (figures 1, 15 and 16).
     out
         Folder to write.
     relief
@@ -157,12 +154,22 @@ def draw_sample(
         raise UnusableError(f"--size-px: got {side}, expected {low} to {high} pixels; change it")
     rng = np.random.default_rng(seed)
     if kind == "sphere":
-        figure, maps, found = _draw_sphere(relief, side, rng, progress)
+        drawn, maps, found = _draw_sphere(relief, side, rng, progress)
+    elif kind == "patch":
+        drawn, maps, found = _draw_patch(relief, side, rng, divisions, progress)
     else:
-        figure, maps, found = _draw_patch(relief, side, rng, divisions, progress)
+        drawn, maps, views = draw_faces(
+            relief.height_um,
+            patch_pixel_um=relief.pixel_um,
+            table=relief.table,
+            texels=side,
+            seed=seed,
+            progress=progress,
+        )
+        found = {"of": views}
     out.mkdir(parents=True, exist_ok=True)
-    name = {"sphere": "figure-5.png", "patch": "figure-14.png"}[kind]
-    write_atomically(out / name, figure)
+    for name, figure in drawn.items():
+        write_atomically(out / name, figure)
     for file, image in maps.items():
         part = out / f".{file}.part.exr"
         store.write_exr(part, image)
@@ -174,7 +181,7 @@ def draw_sample(
         "seed": seed,
         "size_px": side,
         **found,
-        "files": [name, *(f"{file}.exr" for file in maps)],
+        "files": [*drawn, *(f"{file}.exr" for file in maps)],
         "strain_channels": "r_s, r_t, angle of s from +x towards +y, rad",
     }
     write_atomically(out / "sample.json", json.dumps(document, indent=1))
@@ -183,7 +190,7 @@ def draw_sample(
 
 def _draw_sphere(
     relief: SampleRelief, side: int, rng: np.random.Generator, progress: Callable[[str], None]
-) -> tuple[bytes, dict[str, Float32Array], dict[str, Any]]:
+) -> tuple[dict[str, bytes], dict[str, Float32Array], dict[str, Any]]:
     """Return figure 5, maps of the squashed sphere, and variances of slopes by shape."""
     sphere = spheres.Sphere(texels=side)
     rms_um = float(np.std(relief.height_um))
@@ -221,7 +228,8 @@ def _draw_sphere(
         {"relief": kind, "shape": name, "slope_variances": list(made.roughness("front"))}
         for kind, name, made in rows
     ]
-    return encode_figure(figure), maps, {"pixel_um": float(np.min(sphere.pixel_um())), "of": shapes}
+    drawn = {"figure-5.png": encode_figure(figure)}
+    return drawn, maps, {"pixel_um": float(np.min(sphere.pixel_um())), "of": shapes}
 
 
 def _draw_patch(
@@ -230,7 +238,7 @@ def _draw_patch(
     rng: np.random.Generator,
     divisions: tuple[int, int, int],
     progress: Callable[[str], None],
-) -> tuple[bytes, dict[str, Float32Array], dict[str, Any]]:
+) -> tuple[dict[str, bytes], dict[str, Float32Array], dict[str, Any]]:
     """Return figure 14, maps of the pushed patch, and figures of its equilibrium."""
     block = SkinBlock(divisions=divisions)
     pixel_um = 1e3 * block.width_mm / side
@@ -268,7 +276,7 @@ def _draw_patch(
         "mean_free_path_mm": list(SKIN_PATH_MM),
         "rms_um": [float(np.std(neutral)), float(np.std(moved))],
     }
-    return encode_figure(figure), maps, figures
+    return {"figure-14.png": encode_figure(figure)}, maps, figures
 
 
 def shade_patch(patch: PushedPatch, height_um: Float32Array) -> Float64Array:
@@ -293,7 +301,7 @@ def shade_patch(patch: PushedPatch, height_um: Float32Array) -> Float64Array:
     to_light = np.clip(normals @ light, 0.0, 1.0)
     to_view = np.clip(normals @ view, MIN_COSINE, 1.0)
     entered = np.pi * to_light * (1.0 - fresnel.reflectance(to_light, ETA_SKIN))
-    leaves = _scatter(points, area, entered) / np.pi
+    leaves = gather_subsurface(points, area, entered) / np.pi
     leaves *= (1.0 - fresnel.reflectance(to_view, ETA_SKIN))[..., None]
     half = (light + view) / np.linalg.norm(light + view)
     square = FACET_ROUGHNESS**2
@@ -338,31 +346,6 @@ def _normal(points: Float64Array) -> Float64Array:
 
 def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
-def _scatter(points: Float64Array, area: Float64Array, entered: Float64Array) -> Float64Array:
-    """Return the exitance, (N, N, 3), of light that entered, gathered on a coarser grid."""
-    side = points.shape[0]
-    cells = min(SHADED_CELLS, side)
-    starts = np.linspace(0, side, cells, endpoint=False).astype(int)
-
-    def summed(image: Float64Array) -> Float64Array:
-        return np.add.reduceat(np.add.reduceat(image, starts, axis=0), starts, axis=1)
-
-    total = summed(area)
-    place = np.stack([summed(area * points[..., k]) / total for k in range(3)], axis=-1)
-    light = (summed(area * entered) / total).reshape(-1, 1) * np.ones(3)
-    at = place.reshape(-1, 3)
-    found = dipole_gather.exitance(
-        at, total.reshape(-1), light, at, SKIN_COLOR, SKIN_PATH_MM, workers=2
-    ).reshape(cells, cells, 3)
-    where = (np.arange(side) + 0.5) * cells / side - 0.5
-    rows, columns = np.meshgrid(where, where, indexing="ij")
-    planes = [
-        ndimage.map_coordinates(found[..., k], [rows, columns], order=1, mode="nearest")
-        for k in range(3)
-    ]
-    return np.stack(planes, axis=-1)
 
 
 def _project(points: Float64Array, radiance: Float64Array, view: Float64Array) -> Float64Array:

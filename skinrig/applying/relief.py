@@ -12,8 +12,10 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from scipy import ndimage
 
+from model import store
 from model.displacement_synthesis import growth as displacement_synthesis
-from model.displacement_synthesis.sources import level_patch
+from model.displacement_synthesis.sources import SynthesisError, level_patch
+from model.displacement_synthesis.split import SpectrumMatch, add_mesoscale, match_spectrum
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
 from model.microstructure.strain_fields import KernelRegions, rasterize
@@ -76,10 +78,16 @@ class ReliefRequest:
     """Extrapolation beyond the table's range: "hold" or "formula"."""
     seed: int = 0
     """Random seed of the growth."""
+    mesoscale: Path | None = None
+    """Displacement map of a scan over the mesh's texture, um, whose waves above the split stay."""
 
     def __post_init__(self) -> None:
         require_choice("synthesize", self.source, RELIEF_SOURCES, ApplyError)
         require_choice("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
+        if self.mesoscale is not None and self.source != "patches":
+            raise ApplyError(
+                f"--mesoscale: got --synthesize {self.source}, expected patches; remove one"
+            )
 
     @property
     def exceeds_exr(self) -> bool:
@@ -154,7 +162,8 @@ class ReliefEvaluator:
             require_choice("site", asked.site, sites, ApplyError)
         names = [asked.site] if asked.site is not None else list(sites)
         regions = _regions(self.mesh, names)
-        neutral = self._neutral(appearance, {name: sites[name] for name in names}, regions)
+        own = {name: sites[name] for name in names}
+        neutral, spectrum = self._neutral(appearance, own, regions)
         tables = tuple(
             KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
         )
@@ -191,10 +200,13 @@ class ReliefEvaluator:
             **select_attributes(asked, "source", "seed"),
             "tables": [table.source for table in tables],
             "own_shapes": list(self.own_shapes),
+            "spectrum": None if spectrum is None else spectrum.to_json(),
             **figures,
             **seconds,
         }
         done.inputs["mesh"] = self.mesh_sha256
+        if asked.mesoscale is not None:
+            done.inputs["mesoscale"] = _sha256(asked.mesoscale)
         if asked.exceeds_exr:
             done.figures[MICROSTRUCTURE]["files"] = {
                 path.name: _sha256(path)
@@ -203,9 +215,12 @@ class ReliefEvaluator:
 
     def _neutral(
         self, appearance: SkinAppearance, sites: Mapping[str, Any], regions: Float64Array | None
-    ) -> Any:
-        """Return the neutral relief on the mesh's texture, um: grown patches or noise."""
-        asked = self.request
+    ) -> tuple[Any, SpectrumMatch | None]:
+        """Return the neutral relief on the mesh's texture, um: grown patches or noise.
+
+        Of grown patches, also return the filter that matches their spectrum.
+        """
+        asked, match = self.request, None
         patches = {
             name: [level_site_patch(name, appearance, entry)] for name, entry in sites.items()
         }
@@ -242,13 +257,41 @@ class ReliefEvaluator:
                 patch_pixel_um=float(np.mean(pixels_um)),
                 threads=2,
             )
+            self.progress("match the spectrum of the patches")
+            match = match_spectrum(
+                neutral,
+                [(one, pixel) for (one,), pixel in zip(patches.values(), pixels_um, strict=True)],
+                _site_shares(regions),
+                scale / asked.size_px,
+            )
             self.progress("join charts of the texture")
             noise = _draw_noise(_rms(patches), asked.size_px, scale, rng=rng)
             join_charts(neutral, _face(self.mesh), noise)
+        if asked.mesoscale is not None:
+            self.progress("add the mesoscale")
+            _add_mesoscale_map(neutral, asked.mesoscale, self.mesh, scale)
         if asked.exceeds_exr:
             neutral.flush()
             os.replace(growing, self.temporary_folder / "displacement_neutral.npy")
-        return neutral
+        return neutral, match
+
+
+def _add_mesoscale_map(
+    neutral_um: Any, path: Path, mesh: BlendShapeMesh, scale_um: Float64Array
+) -> None:
+    """Add the waves of a scan's displacement map that relief lacks, in place."""
+    given = np.load(path) if path.suffix == ".npy" else store.read_exr(path)
+    if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) > len(neutral_um):
+        shape = " x ".join(str(n) for n in given.shape)
+        raise ApplyError(
+            f"{path}: got a map of {shape}, expected a square one of one channel with at most "
+            f"{len(neutral_um)} pixels per side"
+        )
+    valid = unwrap(_face(mesh), len(given)).covered
+    try:
+        add_mesoscale(neutral_um, given, valid, scale_um / len(given))
+    except SynthesisError as error:
+        raise ApplyError(f"{path}: {error}; give a finer map") from error
 
 
 def _sha256(path: Path) -> str:
@@ -296,6 +339,14 @@ def level_site_patch(
             "a side"
         )
     return level_patch(relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid)
+
+
+def _site_shares(regions: Float64Array | None) -> list[float]:
+    """Return the mean square weight of each site in the map."""
+    if regions is None:
+        return [1.0]
+    squares = regions**2
+    return [float(one) for one in (squares / squares.sum(axis=0)).mean(axis=(1, 2))]
 
 
 def _rms(patches: Mapping[str, Sequence[Float32Array]]) -> float:

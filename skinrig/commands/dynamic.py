@@ -199,8 +199,8 @@ class ReliefOptions:
     Attributes
     ----------
     size_px
-        Width and height of the displacement map, pixels; default 4096, of samples 2048 (sphere) or
-        1000 (patch).
+        Width and height of the displacement map, pixels; default 4096, of samples 2048 (sphere),
+        1000 (patch) or 1200 (face).
     relief_site
         Site whose microrelief covers the whole mesh; default: each fitted site its own region.
     synthesize
@@ -209,6 +209,9 @@ class ReliefOptions:
         Outside the table's stretch range: hold (clamp to its ends) or formula.
     seed
         Random seed of the synthesized relief.
+    mesoscale
+        Displacement map of a scan over the mesh's texture, um, .exr or .npy; its waves above 1 mm
+        are added to the relief.
     """
 
     size_px: int | None = None
@@ -216,6 +219,7 @@ class ReliefOptions:
     synthesize: Annotated[str, choice("patches", "noise")] = "patches"
     extrapolate: Annotated[str, choice("hold", "formula")] = "hold"
     seed: int = 0
+    mesoscale: Path | None = None
 
     def relief(
         self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
@@ -229,7 +233,7 @@ class ReliefOptions:
         """Return the options as a request."""
         from skinrig.applying.relief import ReliefRequest
 
-        given = select_attributes(self, "extrapolate", "seed")
+        given = select_attributes(self, "extrapolate", "seed", "mesoscale")
         size_px = 4096 if self.size_px is None else self.size_px
         return ReliefRequest(size_px, site=self.relief_site, source=self.synthesize, **given)
 
@@ -334,7 +338,7 @@ def apply_microstructure(
     *,
     mesh: Path | None = None,
     weights: str | None = None,
-    on: Annotated[str | None, choice("sphere", "patch")] = None,
+    on: Annotated[str | None, choice("sphere", "patch", "face")] = None,
     out: NewMaps,
     moving: ReliefOptions,
     json: Json = False,
@@ -354,16 +358,18 @@ def apply_microstructure(
     weights
         Weights of blend shapes or expressions: jawOpen=0.5,smile=1.
     on
-        Draw a sample instead of a mesh: sphere (shrunk, grown, squashed) or patch (a block of
-        tetrahedra pushed by a probe, with subsurface scattering).
+        Draw a sample instead of a mesh: sphere (shrunk, grown, squashed), patch (a block of
+        tetrahedra pushed by a probe) or face (photographs of a head's skin in expressions).
     """
     from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
 
     console = Console(json)
     if on is not None:
-        if mesh is not None or weights is not None:
-            raise UsageError("--mesh, --weights: not of a sample; remove them, or --on")
+        if any(given is not None for given in (mesh, weights, moving.mesoscale)):
+            raise UsageError(
+                "--mesh, --weights, --mesoscale: not of a sample; remove them, or --on"
+            )
         _draw_sample(on, appearance, out, moving, console)
         return
     if appearance is None or mesh is None or weights is None:
@@ -382,11 +388,11 @@ def apply_microstructure(
 def _draw_sample(
     kind: str, appearance: Path | None, out: Path, moving: ReliefOptions, console: Console
 ) -> None:
-    """Draw a deformed sphere or patch, and print its figures."""
+    """Draw a deformed sample, and print its figures."""
     from skinrig.applying import microstructure_samples as samples
 
     relief = (
-        samples.SampleRelief.simulated(moving.seed)
+        samples.SampleRelief.simulated(moving.seed, samples.GROWN_PATCH_MM[kind])
         if appearance is None
         else samples.SampleRelief.fitted(appearance, moving.relief_site)
     )

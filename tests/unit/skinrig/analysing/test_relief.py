@@ -93,19 +93,27 @@ def test_stated_error_of_octaves_is_their_spread(rng):
     drawn = []
     for _ in range(40):
         white = ndimage.gaussian_filter(rng.standard_normal((512, 512)), 1.0, mode="wrap")
-        windows = analysing._draw_windows(white, atlas, rng)
-        drawn.append(analysing._mean_octaves(windows))
+        windows = analysing.draw_windows(white, atlas, rng, 5000.0)
+        drawn.append(analysing.mean_octaves(windows))
     mean, error, count = (np.array(part)[:, :3] for part in zip(*drawn, strict=True))
     assert count.min() >= 4
     spread = mean.std(axis=0, ddof=1) / mean.mean(axis=0)
     stated = np.sqrt(np.mean(error**2, axis=0))
     np.testing.assert_allclose(stated, spread, rtol=0.35)
-    places = analysing._draw_windows(np.arange(512.0**2).reshape(512, 512), atlas, rng)
+    places = analysing.draw_windows(np.arange(512.0**2).reshape(512, 512), atlas, rng, 5000.0)
     pixels = np.concatenate([window.ravel() for window, _ in places])
     assert len(np.unique(pixels)) == len(pixels)  # windows that overlap have errors too small
-    alone = analysing._mean_octaves(windows[:1])
+    alone = analysing.mean_octaves(windows[:1])
     assert np.all(np.isnan(alone[1]))
     assert alone[2][0] == 1
+
+
+@pytest.mark.parametrize("side", [397, 400, 404])
+def test_wave_between_octaves_counts_half_in_each(side):
+    wave = np.cos(2.0 * np.pi * np.arange(side) / 100.0)  # 1 mm
+    window = np.broadcast_to(wave, (side, side))
+    found = analysing.mean_octaves([(window, (10.0, 10.0))], (2000.0, 1000.0, 500.0))[0]
+    np.testing.assert_allclose(found, 0.25, atol=0.03)
 
 
 @pytest.mark.long
@@ -117,9 +125,9 @@ def test_map_without_fading_has_steps_at_seams(moving, tmp_path, monkeypatch):
     monkeypatch.setattr(applying, "join_charts", lambda *given: 0.0)
     split = measure_relief(tmp_path / "b", synthesize(moving, mesh, tmp_path / "s", 2048), **how)
     assert split["seam"]["99"] > 3.0 * split["interior"]["99"]
-    for one in joined["octaves"][1:4]:
+    for one in joined["octaves"]:
         assert abs(one["ratio"] - 1.0) < 0.05 + 2.0 * one["stderr"]
-        assert one["stderr"] < 0.05
+    assert max(one["stderr"] for one in joined["octaves"][1:4]) < 0.06
 
 
 def write_relief(folder, kept, large=None):

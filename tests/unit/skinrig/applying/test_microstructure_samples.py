@@ -10,6 +10,7 @@ from model.microstructure import FOREHEAD
 from skinrig.applying import microstructure_samples as samples
 from skinrig.applying.microstructure import strain_image
 from skinrig.applying.pushed_patch import Push, SkinBlock, push_block
+from skinrig.applying.subsurface_grid import SKIN_COLOR, gather_subsurface
 from skinrig.cli import main
 
 
@@ -67,11 +68,11 @@ def test_scattered_light_reaches_shadow_of_step():
     points = np.stack(np.meshgrid(np.linspace(0, 10, side), np.linspace(10, 0, side)), axis=-1)
     points = np.concatenate([points, np.zeros((side, side, 1))], axis=-1)
     lit = np.where(points[..., 0] < 5.0, 1.0, 0.0)
-    found = samples._scatter(points, np.full((side, side), (10 / 63) ** 2), lit)
+    found = gather_subsurface(points, np.full((side, side), (10 / 63) ** 2), lit)
     row = found[side // 2]
-    assert (row[5] > 0.9 * np.array(samples.SKIN_COLOR)).all()
+    assert (row[5] > 0.9 * np.array(SKIN_COLOR)).all()
     red, _, blue = row[side // 2 + 6]  # 1 mm into the dark: red light reaches further
-    assert red / samples.SKIN_COLOR[0] > 2.0 * blue / samples.SKIN_COLOR[2] > 0.0
+    assert red / SKIN_COLOR[0] > 2.0 * blue / SKIN_COLOR[2] > 0.0
 
 
 def test_strain_image_angle_is_axis_of_s(relief):
@@ -79,6 +80,21 @@ def test_strain_image_angle_is_axis_of_s(relief):
     made = samples.spheres.deform(sphere, np.zeros((64, 64)), (0.8, 1.25, 1.0), table=FOREHEAD)
     middle = strain_image(made.strain)[32, 32]
     assert abs(middle[2]) == pytest.approx(np.pi / 2, abs=0.05)
+
+
+@pytest.mark.long
+def test_face_sample_writes_three_figures(relief, tmp_path):
+    found = samples.draw_sample("face", tmp_path, relief, size_px=200)
+    assert [one["figure"] for one in found["of"]] == ["figure-1", "figure-15", "figure-16"]
+    for one in found["of"]:
+        assert (tmp_path / f"{one['figure']}.png").stat().st_size > 10_000
+        strain = store.read_exr(tmp_path / f"{one['figure']}-strain.exr")
+        assert strain[..., 0].max() == pytest.approx(one["stretch_s"][1])
+        variances = one["slope_variances"]
+        stretched = one["stretch_s"][0] > 1.03
+        assert not stretched or variances["dynamic"][0] < variances["static"][0]
+        compressed = one["stretch_t"][1] < 0.97
+        assert not compressed or variances["dynamic"][1] > variances["static"][1]
 
 
 @pytest.mark.long

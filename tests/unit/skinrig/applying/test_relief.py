@@ -135,3 +135,35 @@ def test_spatial_noise_has_patch_height_and_deforms_alike(folder, sheet, tmp_pat
     assert slopes(after, 1) < 0.95 * slopes(before, 1)
     with pytest.raises(ApplyError, match="synthesize"):
         applied(folder, sheet, tmp_path / "no", {"drawn": 1.0}, source="paint")
+
+
+def test_mesoscale_keeps_its_long_waves(folder, sheet, tmp_path):
+    side = 150
+    wave = 40.0 * np.cos(2.0 * np.pi * (np.arange(side) + 0.5) / 50.0)  # 4 mm
+    path = tmp_path / "scan.npy"
+    np.save(path, np.broadcast_to(wave, (side, side)))
+    how = {"size_px": 600}
+    plain, whole = (
+        applied(folder, sheet, tmp_path / name, {"drawn": 0.0}, **how, **more)
+        for name, more in (("a", {}), ("b", {"mesoscale": path}))
+    )
+    assert "mesoscale" in whole.inputs
+    difference = whole.maps["displacement_neutral"].values.astype(float)
+    difference -= plain.maps["displacement_neutral"].values
+    fine = 40.0 * np.cos(2.0 * np.pi * (np.arange(600) + 0.5) / 200.0)
+    np.testing.assert_allclose(difference, np.broadcast_to(fine, (600, 600)), atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "match"), [((150, 140), "150 x 140"), ((20, 20), "finer map"), ((900, 900), "600")]
+)
+def test_unusable_mesoscale_map_is_refused(folder, sheet, tmp_path, shape, match):
+    path = tmp_path / "scan.npy"
+    np.save(path, np.zeros(shape))
+    with pytest.raises(ApplyError, match=match):
+        applied(folder, sheet, tmp_path / "no", {"drawn": 0.0}, size_px=600, mesoscale=path)
+
+
+def test_mesoscale_needs_measured_patches(folder, sheet, tmp_path):
+    with pytest.raises(ApplyError, match="--mesoscale"):
+        applied(folder, sheet, tmp_path / "no", {}, source="noise", mesoscale=tmp_path / "a.npy")
