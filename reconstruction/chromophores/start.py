@@ -56,7 +56,7 @@ class _SameColors:
 
 def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTable:
     """Return the inverted table, cached for the colors of the tables used last."""
-    digest = blake2b(np.ascontiguousarray(table.rgb)).digest()
+    digest = blake2b(table.rgb.tobytes()).digest()
     return _invert_table(_SameColors(digest, table), free_shading)
 
 
