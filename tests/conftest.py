@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import hypothesis
+import keyword_files
 import numpy as np
 import pytest
 import real_time
@@ -105,6 +106,7 @@ class ExamplesAlone:
 
 def pytest_configure(config):
     config.pluginmanager.register(ExamplesAlone())
+    config.pluginmanager.register(keyword_files)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):  # before any process of several compiles

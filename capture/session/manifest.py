@@ -142,8 +142,9 @@ def seal(content: Mapping[str, Any]) -> tuple[bytes, str]:
         When ``content`` contains a value that JSON cannot represent.
     """
     try:
-        digest = hashlib.sha256(_format_document(content)).hexdigest()
-        return _format_document({**content, _SEAL_KEY: f"sha256:{digest}"}), f"sha256:{digest}"
+        entries = {name: _format_entry(value) for name, value in content.items()}
+        digest = f"sha256:{hashlib.sha256(_join_entries(entries)).hexdigest()}"
+        return _join_entries({**entries, _SEAL_KEY: _format_entry(digest)}), digest
     except (TypeError, ValueError, RecursionError) as exc:
         fault = Fault("devices, extra", str(exc), "texts, finite numbers, lists and tables")
         raise SessionError("the manifest cannot be written", faults=[fault]) from exc
@@ -205,5 +206,12 @@ def calibration_refs(
     )
 
 
-def _format_document(content: Mapping[str, Any]) -> bytes:
-    return (json.dumps(content, sort_keys=True, indent=1, allow_nan=False) + "\n").encode("ascii")
+def _format_entry(value: Any) -> str:
+    # an entry of a table is one level deeper; line breaks within texts are escaped
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", "\n ")
+
+
+def _join_entries(entries: Mapping[str, str]) -> bytes:
+    """Return the table of formatted entries, as `json.dumps` with an indent of 1 formats it."""
+    lines = (f"{json.dumps(name)}: {entries[name]}" for name in sorted(entries))
+    return ("{\n " + ",\n ".join(lines) + "\n}\n").encode("ascii")

@@ -148,7 +148,8 @@ def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> Br
     light_radius_rad
         Angular radius of the light to convolve with, rad, in [0, 0.5].
     """
-    columns = [_average_over_light(brdf, light_radius_rad) for brdf in materials.values()]
+    view, lights = _lights_at_nodes(light_radius_rad)
+    columns = [_average_over_light(brdf, view, lights) for brdf in materials.values()]
     if not columns:
         raise BasisError("materials: got none, expected at least one; name a material")
     return _pad_table(np.stack(columns, axis=-1), list(materials), light_radius_rad)
@@ -273,7 +274,7 @@ def _read_rgl(path: Path) -> tuple[Brdf, float]:
 
 def tabulate_column(brdf: Brdf, light_radius_rad: float) -> Float32Array:
     """Return a BRDF at the nodes, (32, 12, 90), 1/sr; see `tabulate` and `basis_from_columns`."""
-    return _average_over_light(brdf, light_radius_rad).astype(np.float32)
+    return _average_over_light(brdf, *_lights_at_nodes(light_radius_rad)).astype(np.float32)
 
 
 def merl_brdf(mean: Float64Array) -> Brdf:
@@ -306,25 +307,39 @@ def _gram(basis: BrdfBasis) -> Float64Array:
     return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
 
 
-def _average_over_light(brdf: Brdf, radius_rad: float) -> Float64Array:
-    """Return a BRDF at the nodes, cosine-weighted and averaged over a disc of light directions."""
+def _lights_at_nodes(
+    radius_rad: float,
+) -> tuple[Float64Array, list[tuple[Float64Array, Float64Array]]]:
+    """Return the view at each node, and directions on a disc of light with their weights."""
     Checks(BasisError).within("light_radius_rad", radius_rad, "[0, 0.5]")
     d, phi, h = np.meshgrid(*grid_nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)
+    view.flags.writeable = light.flags.writeable = False  # all BRDFs are evaluated at the same
     if radius_rad == 0.0:
-        return _fill_unknown(np.asarray(brdf(light, view)))
+        return view, [(light, np.ones(d.shape))]
     # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
     helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
     u = unit_vectors(np.cross(helper, light))
     v = np.cross(light, u)
-    total = np.zeros(d.shape)
-    weight = np.zeros(d.shape)
+    lights = []
     for point in range(7):
         turn = point * np.pi / 3.0
         reach = 0.0 if point == 6 else np.tan(radius_rad) * np.sqrt(2.0 / 3.0)
         to = unit_vectors(light + reach * (np.cos(turn) * u + np.sin(turn) * v))
+        to.flags.writeable = False
+        lights.append((to, (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)))
+    return view, lights
+
+
+def _average_over_light(
+    brdf: Brdf, view: Float64Array, lights: list[tuple[Float64Array, Float64Array]]
+) -> Float64Array:
+    """Return a BRDF at the nodes, averaged over weighted directions of light."""
+    if len(lights) == 1:
+        return _fill_unknown(np.asarray(brdf(lights[0][0], view)))
+    total, weight = np.zeros(view.shape[:-1]), np.zeros(view.shape[:-1])
+    for to, share in lights:
         value = np.asarray(brdf(to, view))
-        share = (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)
         known = np.isfinite(value)
         total += np.where(known, share * np.where(known, value, 0.0), 0.0)
         weight += np.where(known, share, 0.0)

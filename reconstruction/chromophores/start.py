@@ -7,8 +7,9 @@ lighter skin. The start is then on the light side of the fold, and the grid stor
 the other solution.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import blake2b
 
 import numpy as np
 from scipy import ndimage
@@ -45,9 +46,23 @@ class InverseColorTable:
     """Sign of the surface's side, seen along `normal`, that `axes` lie on."""
 
 
-@lru_cache(maxsize=16)
+@dataclass(frozen=True, slots=True)
+class _SameColors:
+    """Table that equals another of the same colors: its inverse depends on nothing else."""
+
+    digest: bytes
+    table: ColorTable = field(compare=False)
+
+
 def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTable:
-    """Return the inverted table, cached for the tables used last."""
+    """Return the inverted table, cached for the colors of the tables used last."""
+    digest = blake2b(table.rgb.tobytes()).digest()
+    return _invert_table(_SameColors(digest, table), free_shading)
+
+
+@lru_cache(maxsize=16)
+def _invert_table(colors: _SameColors, free_shading: bool) -> InverseColorTable:
+    table = colors.table
     fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, _SAMPLES_PER_AXIS)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
     rgb, by_a, by_b = evaluate_table(table, a, b)

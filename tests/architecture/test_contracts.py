@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from fixtures.product_code import PACKAGES, ROOT, modules, tree_of
+from fixtures.product_code import PACKAGES, ROOT, modules, nodes_of, text_of, tree_of
 
 COMPARISONS = {"all", "any", "allclose", "isclose", "array_equal"}
 BEGINS_LIKE_ONE = re.compile(
@@ -37,7 +37,7 @@ def bare_comparisons(text):
 
 
 def test_no_test_compares_without_an_assertion():
-    found = [f"{p}:{line}" for p in modules("tests") for line in bare_comparisons(p.read_text())]
+    found = [f"{p}:{line}" for p in modules("tests") for line in bare_comparisons(text_of(p))]
     assert not found
 
 
@@ -81,9 +81,7 @@ def none_defaults_without_none(tree):
     found = []
     aliases = sorted(aliases_with_none(tree) | imported_aliases_with_none(tree))
     allowed = re.compile("|".join([r"None", r"Any", r"object", *(rf"\b{a}\b" for a in aliases)]))
-    for node in ast.walk(tree):
-        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            continue
+    for node in nodes_of(tree, ast.FunctionDef, ast.AsyncFunctionDef):
         args = node.args
         positional = [*args.posonlyargs, *args.args]
         pairs = list(
@@ -157,9 +155,8 @@ def test_capture_has_no_branch_for_simulation():
     found = [
         f"{p.relative_to(ROOT)}:{node.lineno}"
         for p in modules("capture")
-        for node in ast.walk(tree_of(p))
-        if isinstance(node, ast.If)
-        and re.search(r"[=!]= 'simulated'|\bis_?simulat|\.simulat", ast.unparse(node.test))
+        for node in nodes_of(tree_of(p), ast.If)
+        if re.search(r"[=!]= 'simulated'|\bis_?simulat|\.simulat", ast.unparse(node.test))
     ]
     assert not found
 

@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from fixtures.product_code import PACKAGES, ROOT, modules, tree_of
+from fixtures.product_code import PACKAGES, ROOT, modules, nodes_of, tree_of
 
 MAX_MODULES = 15
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
@@ -97,8 +97,8 @@ def relative_imports(root):
     return [
         f"{path.relative_to(root)}:{node.lineno}"
         for path in modules(*PACKAGES, root=root)
-        for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.ImportFrom) and node.level
+        for node in nodes_of(tree_of(path), ast.ImportFrom)
+        if node.level
     ]
 
 

@@ -31,7 +31,7 @@ HEAVY = (
 QUICK_S = 0.3
 QUICK_HELP_S = 0.5
 RUNS = 5
-"""The quickest of so many starts is judged: what else runs on the machine only adds to one."""
+"""Starts until one is quick enough: what else runs on the machine only adds to one."""
 
 
 def loaded_by(code, candidates=HEAVY):
@@ -66,21 +66,11 @@ def test_capture_and_devices_load_neither_renderer_nor_science():
     assert loaded_by("import " + ", ".join(every)) == []
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--version"],
-        ["--help"],
-        ["simulate", "--help"],
-        ["reconstruct", "--help"],
-        ["fit", "--help"],
-        ["render", "--help"],
-        ["bench", "--help"],
-    ],
-    ids=" ".join,
-)
-def test_asking_for_help_loads_no_numerics_at_all(arguments):
-    code = f"from skinrig.cli import main\nassert main({arguments!r}) == 0"
+def test_asking_for_help_loads_no_numerics_at_all():
+    """One process asks all in turn: what one of them loaded would still be loaded at the end."""
+    asked = [["--version"], ["--help"]]
+    asked += [[name, "--help"] for name in ("simulate", "reconstruct", "fit", "render", "bench")]
+    code = f"from skinrig.cli import main\nassert [main(a) for a in {asked!r}] == [0] * 7"
     assert loaded_by(code, (*HEAVY, "numpy", "capture", "model")) == []
 
 
@@ -88,16 +78,16 @@ def test_a_heavy_import_would_be_found():
     assert loaded_by("import skinrig.cli, scipy.ndimage") == ["scipy"]
 
 
-def least_start_s(arguments, runs=RUNS):
-    """Return the least processor time of some starts, s; waiting for a busy machine is not ours."""
-    spent = []
+def starts_within(limit_s, arguments, runs=RUNS):
+    """Return whether a start takes less processor time than the limit, s, in so many runs."""
     for _ in range(runs):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         run = subprocess.run([COMMAND, *arguments], cwd=ROOT, capture_output=True, text=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert run.returncode == 0, run.stderr
-        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    return min(spent)
+        if after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < limit_s:
+            return True
+    return False
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
@@ -107,14 +97,14 @@ def test_version_is_printed_within_third_of_second():
 
     Starting with NumPy takes 0.25 s or more, and with SciPy or a renderer a second.
     """
-    assert least_start_s(["--version"]) < QUICK_S
+    assert starts_within(QUICK_S, ["--version"])
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
 @pytest.mark.parametrize("command", ["", "simulate flash", "reconstruct", "report", "view"])
 def test_help_is_printed_within_half_second(command):
     """Tolerance: the requirement; a quiet core takes .2 to .3 s."""
-    assert least_start_s([*command.split(), "--help"], runs=2) < QUICK_HELP_S
+    assert starts_within(QUICK_HELP_S, [*command.split(), "--help"], runs=2)
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
@@ -122,4 +112,4 @@ def test_a_slow_start_would_be_found(tmp_path, monkeypatch):
     waste = "import time\nend = time.process_time() + 0.3\nwhile time.process_time() < end: pass\n"
     (tmp_path / "sitecustomize.py").write_text(waste)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    assert least_start_s(["--version"], 1) > QUICK_S
+    assert not starts_within(QUICK_S, ["--version"], runs=1)

@@ -6,21 +6,15 @@ them unless the callee has no machine code of its own.
 """
 
 import ast
-from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+from fixtures.product_code import PACKAGES, modules, nodes_of, text_of, tree_of
 
 
-def read_kernels(text):
+def read_kernels(tree):
     """Return calls' names per kernel, and options of each kernel: name to AST or None."""
-    tree = ast.parse(text)
     calls, options = {}, {}
-    for function in ast.walk(tree):
-        if not isinstance(function, ast.FunctionDef):
-            continue
+    for function in nodes_of(tree, ast.FunctionDef):
         for decorator in function.decorator_list:
             if isinstance(decorator, ast.Call) and ast.unparse(decorator.func).endswith("njit"):
                 names = [c.func.id for c in ast.walk(function) if is_plain_call(c)]
@@ -33,11 +27,11 @@ def is_plain_call(node):
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
 
 
-def read_flags(text):
+def read_flags(tree):
     """Return module-level names whose value contains flags, with the value's text."""
     return {
         target.id: ast.unparse(node.value)
-        for node in ast.parse(text).body
+        for node in tree.body
         if isinstance(node, ast.Assign)
         for target in node.targets
         if isinstance(target, ast.Name) and "MATH" in target.id
@@ -59,12 +53,12 @@ def is_inlined(options):
     )
 
 
-def find_unsafe(texts):
+def find_unsafe(trees):
     """Return kernels that reorder sums, are called by other kernels, and are not inlined."""
     unsafe = []
-    flags = [read_flags(text) for text in texts]
+    flags = [read_flags(tree) for tree in trees]
     shared = {name: value for own in flags for name, value in own.items() if name[0] != "_"}
-    kernels = [read_kernels(text) for text in texts]
+    kernels = [read_kernels(tree) for tree in trees]
     called = set().union(*(names for calls, _ in kernels for names in calls.values()))
     for own, (_, options) in zip(flags, kernels, strict=True):
         unsafe += [
@@ -76,10 +70,9 @@ def find_unsafe(texts):
 
 
 def test_kernels_reordering_sums_are_inlined_in_callers():
-    paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    texts = [text for path in paths if "njit" in (text := path.read_text("utf-8"))]
-    assert len(texts) > 20
-    assert find_unsafe(texts) == []
+    trees = [tree_of(path) for path in modules(*PACKAGES) if "njit" in text_of(path)]
+    assert len(trees) > 20
+    assert find_unsafe(trees) == []
 
 
 @pytest.mark.parametrize(
@@ -100,4 +93,4 @@ def add(x): ...
 @njit(cache=True)
 def run(x): add(x)
 """
-    assert find_unsafe([text]) == (["add"] if unsafe else [])
+    assert find_unsafe([ast.parse(text)]) == (["add"] if unsafe else [])

@@ -6,11 +6,12 @@ import re
 import tokenize
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
+from functools import cache
 from itertools import accumulate
 from pathlib import Path
 
 import pytest
-from fixtures.product_code import PACKAGES, ROOT, modules, text_of, tree_of
+from fixtures.product_code import PACKAGES, ROOT, modules, nodes_of, text_of, tree_of
 
 HISTORY = ("CHANGELOG.md", "docs/decisions")
 """Quoted history keeps its words."""
@@ -62,6 +63,7 @@ def documents() -> list[Path]:
     ]
 
 
+@cache
 def identifier_words(name: str) -> str:
     """Return an identifier as separate words.
 
@@ -73,25 +75,33 @@ def identifier_words(name: str) -> str:
 
 def names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield each name that a module defines, with its line."""
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            yield node.lineno, node.name
-        elif isinstance(node, ast.arg):
-            yield node.lineno, node.arg
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+    for node in nodes_of(tree, ast.FunctionDef, ast.ClassDef):
+        yield node.lineno, node.name
+    for node in nodes_of(tree, ast.arg):
+        yield node.lineno, node.arg
+    for node in nodes_of(tree, ast.Name):
+        if isinstance(node.ctx, ast.Store):
             yield node.lineno, node.id
+
+
+def comments(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the comments of a module; none where no text after a # has a word of the list."""
+    after_sign = (line[line.index("#") :] for line in text.splitlines() if "#" in line)
+    if not any(hits(enumerate(after_sign))):
+        return
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
 
 
 def texts(path: Path) -> Iterator[tuple[int, str]]:
     """Yield strings and comments of a module, line by line, and the words of its names."""
-    for node in ast.walk(tree_of(path)):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+    for node in nodes_of(tree_of(path), ast.Constant):
+        if isinstance(node.value, str):
             for offset, line in enumerate(node.value.splitlines()):
                 yield node.lineno + offset, line
-    for token in tokenize.generate_tokens(io.StringIO(text_of(path)).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string
-    for line, name in names(tree_of(path)):
+    yield from comments(text_of(path))
+    for name, line in {name: line for line, name in names(tree_of(path))}.items():
         yield line, identifier_words(name)
 
 

@@ -4,9 +4,8 @@ import ast
 import socket
 
 import pytest
-from fixtures.product_code import ROOT
+from fixtures.product_code import PACKAGES, ROOT, modules, nodes_of, tree_of
 
-PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 NETWORK = {"aiohttp", "ftplib", "http", "httpx", "requests", "smtplib", "socket", "socketserver"}
 NETWORK |= {"ssl", "telnetlib", "urllib", "urllib3", "webbrowser", "websockets", "xmlrpc"}
 HARMLESS = {"urllib.parse", "http"}
@@ -21,17 +20,16 @@ PERMITTED = {
 
 def network_imports():
     found = {}
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-                names = []
-                if isinstance(node, ast.Import):
-                    names = [alias.name for alias in node.names]
-                elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                    names = [node.module]
-                for name in names:
-                    if name.partition(".")[0] in NETWORK and name not in HARMLESS:
-                        found[path.relative_to(ROOT).as_posix()] = name
+    for path in modules(*PACKAGES):
+        for node in nodes_of(tree_of(path), ast.Import, ast.ImportFrom):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif node.module and not node.level:
+                names = [node.module]
+            for name in names:
+                if name.partition(".")[0] in NETWORK and name not in HARMLESS:
+                    found[path.relative_to(ROOT).as_posix()] = name
     return found
 
 

@@ -5,7 +5,7 @@ import re
 from functools import cache
 
 import pytest
-from fixtures.product_code import PACKAGES, ROOT, modules, text_of
+from fixtures.product_code import PACKAGES, ROOT, modules, nodes_of, text_of, tree_of
 
 SCIPY_SEARCHES = {
     *("least_squares", "minimize", "minimize_scalar", "curve_fit", "fsolve", "root"),
@@ -42,26 +42,21 @@ NEED_NO_REPORT = {
 """Iterative modules that neither hold an outcome, nor warn or raise, with the reason."""
 
 
-def describe_iterations(source):
-    """Return the solvers of a module's text: SciPy's, and loops that end early or at a limit."""
-    tree = ast.parse(source)
+def describe_iterations(tree):
+    """Return the solvers of a module: SciPy's, and loops that end early or at a limit."""
     found, imported = set(), set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            imported |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
-            if isinstance(node, ast.ImportFrom):
-                found |= SCIPY_SEARCHES & {alias.name for alias in node.names}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and node.attr in SCIPY_SEARCHES:
+    for node in nodes_of(tree, ast.Import, ast.ImportFrom):
+        imported |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            found |= SCIPY_SEARCHES & {alias.name for alias in node.names}
+    for node in nodes_of(tree, ast.Attribute):
+        if node.attr in SCIPY_SEARCHES:
             base = node.value
             while isinstance(base, ast.Attribute):
                 base = base.value
             if isinstance(base, ast.Name) and base.id in imported:
                 found.add(node.attr)
-            continue
-        bounded = isinstance(node, ast.For | ast.While)
-        if not bounded:
-            continue
+    for node in nodes_of(tree, ast.For, ast.While):
         head = node.iter if isinstance(node, ast.For) else node.test
         named = [n for n in ast.walk(head) if isinstance(n, ast.Name | ast.Attribute)]
         names = [getattr(n, "id", getattr(n, "attr", "")) for n in named]
@@ -82,7 +77,7 @@ def iterative_modules():
         (path.relative_to(ROOT).as_posix(), text_of(path), found)
         for path in modules(*PACKAGES)
         if not {"benchmarks", "extremes"} & set(path.parts)
-        and (found := describe_iterations(text_of(path)))
+        and (found := describe_iterations(tree_of(path)))
     ]
 
 
@@ -110,7 +105,7 @@ def test_reasons_are_of_modules_that_iterate():
     ],
 )
 def test_solver_scan_finds_loops_and_searches(source, found):
-    assert describe_iterations(source) == found
+    assert describe_iterations(ast.parse(source)) == found
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import ast
 from functools import cache, lru_cache
 
 import pytest
-from fixtures.product_code import ROOT, modules, tree_of
+from fixtures.product_code import ROOT, modules, nodes_of, text_of, tree_of
 
 PACKAGES = ("model", "reconstruction")
 STAGES = "reconstruction.pipeline."
@@ -60,8 +60,8 @@ def defined_at(name):
 def modules_of(tree):
     """Local name to module, or to function where one is imported by itself."""
     names = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
+    for node in nodes_of(tree, ast.ImportFrom):
+        if node.module:
             for alias in node.names:
                 names[alias.asname or alias.name] = f"{node.module}.{alias.name}"
     return names
@@ -105,7 +105,7 @@ def driven_by(path):
 def driven():
     found = set()
     for path in sorted((ROOT / "tests").glob("**/test_*.py")):
-        if "@given" in path.read_text(encoding="utf-8"):
+        if "@given" in text_of(path):
             found |= driven_by(path)
     return {defined_at(name) for name in found} & public_functions()
 
@@ -113,11 +113,11 @@ def driven():
 def names_used(tree, names):
     """Functions that a tree names, by its imports: `names` as `modules_of` gives them."""
     found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            if node.value.id in names:
-                found.add(defined_at(f"{names[node.value.id]}.{node.attr}"))
-        elif isinstance(node, ast.Name) and node.id in names:
+    for node in nodes_of(tree, ast.Attribute):
+        if isinstance(node.value, ast.Name) and node.value.id in names:
+            found.add(defined_at(f"{names[node.value.id]}.{node.attr}"))
+    for node in nodes_of(tree, ast.Name):
+        if node.id in names:
             found.add(defined_at(names[node.id]))
     return found
 

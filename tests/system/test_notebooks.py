@@ -11,6 +11,8 @@ FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 RUNNER = """
 import ast, json, sys
+from skinrig.simulating import probe
+probe.TRUTH_PHOTONS["small"] = 15_000
 names = {}
 for cell in json.load(open(sys.argv[1]))["cells"]:
     if cell["cell_type"] == "code":
@@ -22,7 +24,10 @@ for cell in json.load(open(sys.argv[1]))["cells"]:
             show = getattr(value, "_repr_html_", None)
             print(len(show()) if show else repr(value))
 """
-"""What a kernel does: cells run in one namespace, and the value of a last expression is shown."""
+"""What a kernel does: cells run in one namespace, and the value of a last expression is shown.
+
+A quarter of the probe's photons: other tests judge the accuracy of its sessions.
+"""
 
 pytest.importorskip("xarray")
 

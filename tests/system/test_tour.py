@@ -41,7 +41,8 @@ def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys
     # smaller than their defaults: how accurate maps of more pixels and lights are, other tests say
     monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 256)
     monkeypatch.setitem(dome.WIDTHS_PX, "small", 200)
-    monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 24)
+    monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 21)
+    monkeypatch.setitem(dome.VIEW_COUNTS, "small", 5)
     lines = commands(page)
     assert lines
     for words in lines:

@@ -1,6 +1,7 @@
 """Sessions: what is committed stays, what does not belong is refused, what is known is kept."""
 
 import errno
+import hashlib
 import json
 import os
 import threading
@@ -26,6 +27,7 @@ from capture.session import (
     verification,
     verify,
 )
+from capture.session.manifest import seal
 
 RIG = load_rig("flash").resized(16)
 PLAN = flash_plan(RIG, states=("neutral", "anger"), darks=1)
@@ -570,3 +572,14 @@ def test_only_a_closed_and_sound_session_is_copied(tmp_path, session):
     file.write_bytes(file.read_bytes()[:-1] + b"\xff")
     with pytest.raises(SessionDamage, match="D000"):
         reopen_copy(session.path, tmp_path / "copy")
+
+
+def test_sealed_bytes_are_those_of_the_json_module():
+    content = {"z": {"b": [1.5, {"a": None}], "a": []}, "schema": "x\ny", "\u00fc": {}}
+    data, digest = seal(content)
+    unsealed, sealed = (
+        (json.dumps(table, sort_keys=True, indent=1) + "\n").encode("ascii")
+        for table in (content, {**content, "seal": digest})
+    )
+    assert data == sealed
+    assert digest == f"sha256:{hashlib.sha256(unsealed).hexdigest()}"

@@ -23,7 +23,9 @@ from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.fitting.wrinkles import fit_wrinkles
 from skinrig.reporting import provenance, report
 
-WIDTH_PX = 192
+PLAIN = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
+"""Effects that consent does not depend on."""
+FLASH = {"width_px": 160, "seed": 4}
 DAY = date(2026, 1, 1)
 NARROW = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2030-01-01"}
 OTHER = {"pseudonym": "P007", "consent_scope": ["teaching"], "consent_expires": None}
@@ -137,16 +139,11 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
         "create",
         classmethod(lambda *a, **k: create(*a, **{**k, "source": "measured", "subject": narrow})),
     )
-    simulate_session(
-        "flash",
-        tmp_path / "session-face",
-        subject="II",
-        states=("neutral", "anger"),
-        width_px=WIDTH_PX,
-        seed=4,
-    )
+    states = ("neutral", "anger")
+    about = FLASH | {"subject": "II", "states": states, "leave_out": PLAIN}
+    simulate_session("flash", tmp_path / "session-face", **about)
     monkeypatch.undo()
-    simulate_session("flash", tmp_path / "white", target="white", width_px=WIDTH_PX, seed=4)
+    simulate_session("flash", tmp_path / "white", target="white", **FLASH)
     calibrate("white", [tmp_path / "white"], tmp_path / "calibration")
     marks = tmp_path / "marks"
     marks.mkdir()
