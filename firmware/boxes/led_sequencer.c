@@ -41,6 +41,7 @@ static void forget_steps(void) {
 void sequencer_reset(bool power_up) {
   (void)power_up;
   box_go_dark();
+  bank_forget_failed();
   us_t judged_at = unit.judged_at; /* an answer may still be due */
   bool darkened = unit.darkened;
   memset(&unit, 0, sizeof unit);
@@ -406,6 +407,19 @@ COMMAND(get_safe_eyes) {
   put_flash(answer, unit.eyes == EYES_OPEN     ? P("OPEN")
                     : unit.eyes == EYES_CLOSED ? P("CLOSED")
                                                : P("SHIELDED"));
+  return CODE_OK;
+}
+
+COMMAND(get_led_fail) {
+  UNUSED;
+  for (uint16_t digits = (LEDS + 3) / 4; digits--;) {
+    uint8_t digit = 0;
+    for (uint8_t k = 0; k < 4; k++) {
+      uint16_t led = (uint16_t)(4 * digits + k);
+      if (led < LEDS && bank_has_failed(led)) digit |= (uint8_t)(1u << k);
+    }
+    put_hex(answer, digit, 1, true);
+  }
   return CODE_OK;
 }
 

@@ -5,8 +5,13 @@ steps autonomously, releases the cameras of a row's mask once its light is stead
 release as an event ``SEQ:STEP``. Light is refused beyond the duty (101), heat (102) or dose (104)
 limit of an LED. Until the operator has confirmed that the subject's eyes are closed or shielded, it
 is also refused beyond the flicker limit for open eyes (105). Heat, dose and duty survive a reset.
+
+A table is judged as if its LEDs were lit. Where one is found to draw no current, the sequence ends
+in darkness (``LED:FAIL``, ``SEQ:STOP``). Until the next reset the LED is neither driven nor judged
+as lit; ``LED:FAIL?`` lists such LEDs.
 """
 
+import math
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -113,6 +118,7 @@ class LedSequencer(Device, Generic[RowT]):
         self.table: list[RowT] = []
         self.mask = (1 << self._cameras) - 1
         self.eyes = "OPEN"
+        self.bank.failed.clear()
         self._sequence_armed = False
         self._run = None
         self._steps: dict[int, int] = {}
@@ -158,6 +164,7 @@ class LedSequencer(Device, Generic[RowT]):
             "CAM:TRIG": self._release,
             "SAFE:EYES": self._set_eyes,
             "SAFE:EYES?": lambda *_: self.eyes,
+            "LED:FAIL?": self._list_failed,
             "DOSE?": self._dose,
             "DOSE:NEW": self._new_subject,
         }
@@ -188,6 +195,17 @@ class LedSequencer(Device, Generic[RowT]):
         if tripped:
             self._events += [("LED:HOT", str(led)) for led in tripped]
             self.go_dark(now)
+
+    def _switch_on(self, leds: Mapping[int, float], now: float, *, end_s: float = math.inf) -> bool:
+        """Light LEDs at their levels; report those newly found dead, and return False for any."""
+        found = [
+            led
+            for led, level in leds.items()
+            if not self.bank.switch_on(led, level, now, end_s=end_s)
+        ]
+        for led in found:
+            self.queue_event("LED:FAIL", str(led))
+        return not found
 
     def _switch(self, run: SequenceRun[RowT], switch: SequenceEvent, now: float) -> None:
         if switch.action == "pulse":
@@ -362,6 +380,10 @@ class LedSequencer(Device, Generic[RowT]):
     def _set_eyes(self, arguments: str, now: float) -> None:
         self.eyes = parse_choice(arguments, EYE_STATES)
         self._sequence_armed = False
+
+    def _list_failed(self, _: str, now: float) -> str:
+        mask = sum(1 << led for led in self.bank.failed)
+        return f"{mask:0{-(-self.bank.count // 4)}X}"
 
     def _dose(self, arguments: str, now: float) -> str:
         return f"{self.bank.dose_ws(parse_integer(arguments, 0, self.bank.count - 1)):.6f}"
