@@ -374,7 +374,7 @@ def failed_in(bench):
     return {led for led in range(150) if int(mask, 16) >> led & 1}
 
 
-def test_dead_led_ends_sequence_and_is_not_driven_again():
+def test_dead_led_ends_sequence_and_stays_dark():
     a, b, c = behind(3)
     bench = DOME.bench(led_dead=str(b))
     bench.ask("SYST:ARM")
