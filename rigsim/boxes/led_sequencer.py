@@ -15,7 +15,7 @@ import math
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
@@ -45,6 +45,8 @@ from rigsim.boxes.led_table import (
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_RANGE_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
+FLICKER_FUSION_US = 15_385
+"""Shortest darkness that an eye perceives, us."""
 FLICKER_HISTORY_S = 1.0
 """Past interval whose light is evaluated together with the requested light, s."""
 
@@ -287,8 +289,9 @@ class LedSequencer(Device, Generic[RowT]):
             raise CommandRefused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
         self._require_closed_stop()
         wanted = self._pulses_from_table(self.table, now)
+        self.bank.all_off(now)  # else light whose end is not known would precede the table
         duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
-        flicker = self._flicker(wanted, now)
+        flicker = self._flicker(wanted, now, gap_us=FLICKER_FUSION_US)
 
         def conclude() -> str:
             flashes, rms = self._require_no_flicker(*flicker)
@@ -314,10 +317,19 @@ class LedSequencer(Device, Generic[RowT]):
         """Return flashes per second and rms of the request, or refuse it for open eyes."""
         return self._require_no_flicker(*self._flicker(wanted, now))
 
-    def _flicker(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
-        """Return flashes per second, with those of the last second, and rms of the request."""
+    def _flicker(
+        self, wanted: Sequence[LedPulse], now: float, *, gap_us: int = 0
+    ) -> tuple[float, float]:
+        """Return flashes per second, with those of the last second, and rms of the request.
+
+        Light of the last second is moved `gap_us` back: a table may begin at any time after this.
+        """
         past = [
-            pulse for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S) if pulse.t_on_s < now
+            replace(
+                pulse, t_on_s=add_us(pulse.t_on_s, -gap_us), t_off_s=add_us(pulse.t_off_s, -gap_us)
+            )
+            for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S)
+            if pulse.t_on_s < now
         ]
         return self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
 
@@ -337,8 +349,6 @@ class LedSequencer(Device, Generic[RowT]):
         CommandRefused.raise_if(
             not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM checks the table first"
         )
-        # light in progress at SEQ:ARM, or switched on after it, has been emitted by now
-        self.bank.require_within_limits(self._pulses_from_table(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)

@@ -16,6 +16,7 @@ from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
 from rigsim.boxes.led_table import LEVEL_STEPS, LedTableRow, table_crc
+from skinrig.soaking.light_limits import find_limit_violations
 
 WHOLE = load_rig("dome")
 RIG = DOME.rig
@@ -241,16 +242,42 @@ def test_duty_counts_light_of_before_the_table(bench):
     assert bench.code("SEQ:ARM 1") == Code.DUTY
 
 
-def test_light_running_at_arming_counts_toward_table(bench):
+def test_light_running_at_arming_goes_out_and_counts(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.ask("SYST:ARM")
     bench.ask("SEQ:DEF 0,17:1000:40000:7")
     bench.ask("LED:ON 17,240")
-    bench.ask("SEQ:ARM 1")
-    bench.wait(0.3)
-    assert bench.code("TRIG r1") == Code.DUTY
+    bench.wait(0.22)
+    assert bench.code("SEQ:ARM 1") == Code.DUTY
+    assert not bench.unit.lit
     bench.wait(1.0)
+    bench.ask("LED:ON 17,100")
+    bench.wait(0.05)
+    assert float(bench.ask("SEQ:ARM 1").split(",")[2]) == pytest.approx(0.09, abs=1e-3)
+    assert not bench.unit.lit
     bench.ask("TRIG r2")
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.05, 0.25, 0.4])
+def test_pause_before_trigger_adds_no_uncounted_flash(bench, pause_s):
+    """Light just before SEQ:ARM is a flash of its own if the table begins later."""
+    lit, *others = front(6)
+    rows = [LedTableRow((lit,), LEVEL_STEPS, 60_000, 7), LedTableRow((), 0, 60_000, 0)] * 2
+    rows += rows_of(others[1:], ms=200)
+    bench.ask("SYST:ARM")
+    bench.ask("SYST:WDOG 5000")
+    bench.load(rows)
+    assert float(bench.ask(f"SEQ:ARM {len(rows)}").split(",")[0]) == 2.5
+    bench.ask(f"LED:ON {others[0]},50")
+    bench.wait(0.03)
+    assert bench.code(f"SEQ:ARM {len(rows)}") == Code.FLICKER
+    bench.wait(1.1)
+    assert bench.code(f"SEQ:ARM {len(rows)}") == Code.OK
+    bench.wait(pause_s)
+    bench.ask("TRIG r1")
+    bench.wait(3.0)
+    emitted = {"pops": [], "switched": bench.world.switched, "eyes": "open"}
+    assert list(find_limit_violations(RIG, **emitted)) == []
 
 
 def test_led_warms_as_rc_circuit_and_trips():
