@@ -13,7 +13,6 @@ from typing import Any
 
 from capture.acquire.frames import configure_camera, requested_exposure
 from capture.acquire.outcome import (
-    MAX_ATTEMPTS,
     AcquisitionError,
     AcquisitionResult,
     CaptureRun,
@@ -21,7 +20,7 @@ from capture.acquire.outcome import (
     step_limit_error,
 )
 from capture.acquire.stripes import prepare_scan
-from capture.acquire.table_run import TableRun
+from capture.acquire.table_run import TableRun, count_attempts
 from capture.devices.camera import Frame
 from capture.devices.dome import DomeBox, TableRow
 from capture.devices.led_box import Eyes, LedBox
@@ -39,7 +38,7 @@ MAX_BUFFERED_PIXEL_BYTES = 384 * 2**20
 """Largest number of pixels in memory at once."""
 ROW_POLL_S = 0.2
 MIN_DARK_GAP_S = 1.1
-"""Dark time between single rows, s, so that no second contains more than one flash of them."""
+"""Dark time between parts of a sequence, s, after which the light of before does not count."""
 DOME_LEASE_S = 2.0
 
 
@@ -178,7 +177,7 @@ class _Sequences:
         """Take the steps of one sequence, and repeat those that a camera has missed."""
         left = list(piece)
         why = ""
-        for attempt in range(1, MAX_ATTEMPTS + 1):
+        for attempt in count_attempts(self._box):
             self._run.retakes += len(left) if attempt > 1 else 0
             left, why = self._attempt(left, attempt)
             if not left:
@@ -188,21 +187,24 @@ class _Sequences:
         raise self._run.retry_limit_error(f"{len(left)} steps from {left[0].id} on", why)
 
     def _attempt(self, steps: list[Step], attempt: int) -> tuple[list[Step], str]:
-        """Run steps as one sequence, or one by one when that would flicker too much.
+        """Run steps as one sequence, or in halves when that would flicker too much.
 
-        The controller also counts light of before: after a short dark time a single step passes.
+        The controller also counts light of before: each half follows a short dark time, after which
+        a single step passes. A dead LED makes its row dark, which is a flash between lit rows.
         """
         try:
             return self._sequence(steps, attempt)
         except CommandRefused as error:
             if error.code not in (Code.FLICKER, Code.DUTY):
                 raise
-            log.info("%s; the %d steps are taken one by one", error, len(steps))
+            log.info("%s; the %d steps are taken in parts", error, len(steps))
+        half = (len(steps) + 1) // 2
         left: list[Step] = []
         why = ""
-        for step in steps:
+        for part in filter(None, (steps[:half], steps[half:])):
             self._box.listen(MIN_DARK_GAP_S)
-            missing, reason = self._sequence([step], attempt)
+            take = self._attempt if len(part) > 1 else self._sequence
+            missing, reason = take(part, attempt)
             left += missing
             why = reason or why
         return left, why
@@ -227,8 +229,6 @@ class _Sequences:
             poll_s=ROW_POLL_S,
             what=("sequence", "rows"),
         )
-        if table.lost_reports:  # one may have been that of a dead LED
-            box.find_failed_leds(led for number in table.times_s for led in rows[number].leds)
         missing = self._gather(steps, rows, table, attempt)
         return missing, table.end()
 

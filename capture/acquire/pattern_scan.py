@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from capture.acquire.frames import configure_camera, requested_exposure
-from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
-from capture.acquire.table_run import TableRun
+from capture.acquire.outcome import CaptureRun
+from capture.acquire.table_run import TableRun, count_attempts
 from capture.devices.camera import Frame
 from capture.devices.gradient_sphere import ANALYZER_DEG, GradientSphereBox, PatternRow
 from capture.devices.led_box import TableEvaluation
@@ -80,7 +80,7 @@ class PatternScanner:
         """
         found: dict[str, StepFrames] = {}
         why = ""
-        for attempt in range(1, MAX_ATTEMPTS + 1):
+        for attempt in count_attempts(self._sphere):
             left = [step for step in steps if step.id not in found]
             self._run.retakes += len(left) if attempt > 1 else 0
             taken, why = self._sequence(left, attempt)

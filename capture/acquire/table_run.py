@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.acquire.frames import frame_timeout_s, requested_exposure
-from capture.acquire.outcome import CaptureRun
+from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
 from capture.devices.camera import (
     Camera,
     CameraError,
@@ -74,6 +74,19 @@ def arm_camera(camera: Camera, count: int, box_clock_s: Callable[[], float]) -> 
         log.info("%s", error)
     camera.arm(count, Trigger.EDGE)
     return compare_clocks(camera, box_clock_s)
+
+
+def count_attempts(box: LedBox) -> Iterator[int]:
+    """Yield the number of each attempt at a table, from 1 to `MAX_ATTEMPTS` or beyond.
+
+    A controller ends a table at an LED that it finds to draw no current; such an attempt is one
+    more.
+    """
+    number, most = 0, MAX_ATTEMPTS
+    while number < most:
+        number, known = number + 1, len(box.failed_leds)
+        yield number
+        most += len(box.failed_leds) > known
 
 
 class FrameStream:
@@ -216,8 +229,6 @@ class TableRun:
     ----------
     times_s : dict of int to float
         Time at which each row released the cameras, on the controller's clock.
-    lost_reports : bool
-        Whether the line has lost events of the controller meanwhile.
     """
 
     def __init__(
@@ -238,11 +249,9 @@ class TableRun:
             name: arm_camera(camera, len(steps), box.ping) for name, camera in self._cameras.items()
         }
         keep_alive()
-        lost_before = box.lost_events
-        self.lost_reports = False
         began_s = box.trigger(token)
         self.times_s = self._listen(token, began_s, poll_s, keep_alive)
-        self.lost_reports |= box.lost_events > lost_before
+        box.find_failed_leds()
         self._streams = {
             name: FrameStream(
                 name,
@@ -280,7 +289,7 @@ class TableRun:
             return {}
         for row in range(len(self._steps)):  # query the times whose reports were lost on the line
             if row not in times and (time_s := self._box.step_time(row)) is not None:
-                times[row], self.lost_reports = time_s, True
+                times[row] = time_s
         if position.state != "DONE":  # the light of its last row was cut short
             times.pop(position.row, None)
         return times

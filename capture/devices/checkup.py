@@ -14,7 +14,7 @@ from capture.devices import wire
 from capture.devices.port import CommandRefused, DeviceError, Port
 from capture.devices.wire import Code, Event, Reply, Request
 
-PROTOCOL_MINOR = 2
+PROTOCOL_MINOR = 3
 """Revision of the protocol's text that this host follows; see `protocol_minor`."""
 LEASE_RANGE_MS = (300, 5000)
 MAX_CLOCK_ERROR = 0.01

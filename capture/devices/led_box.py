@@ -5,7 +5,7 @@ table against its limits; the trigger starts it. The controller then steps on it
 each camera release. The lease runs meanwhile: `LedBox.listen` renews it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +18,8 @@ EYE_STATES: tuple[str, ...] = ("open", "closed", "shielded")
 LEVEL_STEPS = 1000
 _PROGRAM_POLL_S = 0.1
 """Interval between two renewals of the lease, s; shorter than the shortest lease."""
+_FAILURES_MINOR = 3
+"""First revision of the protocol whose controllers list the LEDs that draw no current."""
 _MAX_PROGRAM_LINE_BYTES = 200
 """Rows per line: a short line survives a bad cable."""
 
@@ -86,13 +88,11 @@ class LedBox(EyeSafetyBox):
     Attributes
     ----------
     failed_leds : set of int
-        Numbers of the LEDs that the controller has reported as drawing no current, or that have
-        emitted nothing in a table.
+        Numbers of the LEDs that the controller has found to draw no current.
     """
 
     def __init__(self, port: Port, *, serial: str = "") -> None:
         self.failed_leds: set[int] = set()
-        self._emitting: set[int] = set()
         super().__init__(port, serial=serial)
 
     # sequence ---------------------------------------------------------------------------------
@@ -126,11 +126,6 @@ class LedBox(EyeSafetyBox):
         reports whether it runs, unless the controller has rebooted.
         """
         return self._token_time("TRIG", token)
-
-    @property
-    def lost_events(self) -> int:
-        """Number of the controller's events that the line has lost, as later ones show."""
-        return self._port.statistics.lost_events
 
     def position(self) -> SequencePosition:
         """Return the progress of the sequence."""
@@ -180,24 +175,20 @@ class LedBox(EyeSafetyBox):
         """Return the energy that an LED has emitted to this subject, Ws."""
         return self._number(f"DOSE? {led}")
 
-    def find_failed_leds(self, lit: Iterable[int]) -> None:
-        """Add LEDs that have emitted nothing to `failed_leds`.
+    def find_failed_leds(self) -> None:
+        """Add the LEDs that draw no current to `failed_leds`.
 
-        The controller reports an LED that draws no current by an event, which a bad line can lose.
-        Its dose answers a request. Each LED is asked for once per subject at most.
-
-        Parameters
-        ----------
-        lit
-            Numbers of LEDs that a table has switched on.
+        A bad line can lose the event of such an LED; this query is repeated until it is answered.
+        Controllers of revisions before 1.3 have the event alone.
         """
-        for led in sorted(set(lit) - self._emitting - self.failed_leds):
-            (self._emitting if self.dose_ws(led) > 0.0 else self.failed_leds).add(led)
+        if int(self.limits.get("protocol_minor", 0)) < _FAILURES_MINOR:
+            return
+        mask = self._read("LED:FAIL?", lambda got: int(got, 16), "hexadecimal digits")
+        self.failed_leds.update(led for led in range(mask.bit_length()) if mask >> led & 1)
 
     def new_subject(self, pseudonym: str) -> None:
         """Restart the dose counter and clear the state of the eyes."""
         self._port.ask(f"DOSE:NEW {pseudonym}")
-        self._emitting.clear()
 
 
 def _parse_evaluation(payload: str) -> TableEvaluation:

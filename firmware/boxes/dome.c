@@ -124,7 +124,7 @@ void table_light(int32_t only, visit_pulse *visit, void *context) {
     count = kept;
     for (uint8_t k = 0; row && k < row->count; k++) {
       uint16_t led = row->leds[k];
-      bool goes_on = only >= 0 && led != (uint32_t)only;
+      bool goes_on = bank_has_failed(led) || (only >= 0 && led != (uint32_t)only);
       for (uint8_t j = 0; j < count; j++) goes_on |= going[j].led == led;
       if (goes_on) continue;
       us_t early = before && !has_led(before, led) ? OVERLAP_US : 0;
@@ -165,25 +165,17 @@ void kind_next_step(struct step *step) {
   }
 }
 
-static void turn_on(uint16_t led, double level) {
-  if (bank_switch_on(led, level, NEVER)) return;
-  put_int(event_start(P("LED:FAIL")), led);
-  event_end();
-}
-
 void kind_switch(const struct step *step) {
   const struct row *row = &table[step->row], *before = step->row ? row - 1 : NULL;
-  if (step->action == EARLY_ON) {
-    for (uint8_t k = 0; k < row->count; k++)
-      if (!has_led(before, row->leds[k])) turn_on(row->leds[k], level_of(row));
-    return;
-  }
-  for (uint8_t k = 0; before && k < before->count; k++)
+  bool early = step->action == EARLY_ON, works = true;
+  for (uint8_t k = 0; !early && before && k < before->count; k++)
     if (!has_led(row, before->leds[k])) bank_switch_off(before->leds[k]);
   for (uint8_t k = 0; k < row->count; k++) {
-    bool changes = before && before->level != row->level && has_led(before, row->leds[k]);
-    if (!before || changes) turn_on(row->leds[k], level_of(row));
+    bool held = before && has_led(before, row->leds[k]);
+    bool changes = !before || (held && before->level != row->level);
+    if (early ? !held : changes) works &= bank_switch_on(row->leds[k], level_of(row), NEVER);
   }
+  if (!works) box_go_dark();
 }
 
 /* single LEDs ----------------------------------------------------------------------------- */
@@ -223,7 +215,7 @@ COMMAND(do_led_on) {
   TRY(require_few());
   TRY(refuse_open_stop());
   for (uint8_t k = 0; k < unit.count; k++) {
-    if (board_set_led(unit.leds[k], -1.0)) continue;
+    if (!bank_has_failed(unit.leds[k]) && board_set_led(unit.leds[k], -1.0)) continue;
     refuse(CODE_HARDWARE, P("LED "));
     put_int(reason(), unit.leds[k]);
     put_flash(reason(), P(" draws no current"));

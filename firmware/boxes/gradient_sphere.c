@@ -16,7 +16,6 @@ static KEPT struct {
 
 static STATE struct {
   uint16_t gains[LEDS], gains_sent;
-  bool failed[LEDS]; /* already reported */
   uint8_t shining;
   /* the light that PATT asks for */
   uint8_t pattern;
@@ -72,16 +71,15 @@ static double driven_level(uint16_t led, uint8_t pattern, double level) {
   return level * ((double)unit.gains[led] / LEVEL_STEPS) * PATTERN_SHARE[pattern][led];
 }
 
-static void start_pattern(uint8_t pattern, double level, us_t end) {
+/* Replace the light by a pattern; false: an LED is newly found to draw no current. */
+static bool start_pattern(uint8_t pattern, double level, us_t end) {
+  bool works = true;
   bank_all_off();
-  if (pattern == DARK) return;
+  if (pattern == DARK) return true;
   unit.shining = pattern;
-  for (uint16_t led = 0; led < LEDS; led++) {
-    if (bank_switch_on(led, driven_level(led, pattern, level), end) || unit.failed[led]) continue;
-    unit.failed[led] = true;
-    put_int(event_start(P("LED:FAIL")), led);
-    event_end();
-  }
+  for (uint16_t led = 0; led < LEDS; led++)
+    works &= bank_switch_on(led, driven_level(led, pattern, level), end);
+  return works;
 }
 
 static void visit_pattern(uint8_t pattern, double level, us_t on, us_t off, int32_t only,
@@ -91,7 +89,7 @@ static void visit_pattern(uint8_t pattern, double level, us_t on, us_t off, int3
   uint16_t last = only < 0 ? LEDS - 1 : (uint16_t)only;
   for (uint16_t led = first; led <= last; led++) {
     struct pulse pulse = {driven_level(led, pattern, level), on, off, led};
-    if (pulse.level > 0.0) visit(&pulse, context);
+    if (pulse.level > 0.0 && !bank_has_failed(led)) visit(&pulse, context);
   }
 }
 
@@ -135,7 +133,6 @@ COMMAND(do_patt) {
   TRY(bank_require_within_limits(single_light, &loads));
   TRY(require_flicker_limits(single_light));
   disarm_sequence();
-  memset(unit.failed, 0, sizeof unit.failed);
   start_pattern(unit.pattern, unit.level, unit.end);
   return CODE_OK;
 }
@@ -221,7 +218,6 @@ static void begin_row(struct step *step, us_t at, uint16_t row) {
 }
 
 void kind_first_step(struct step *step) {
-  memset(unit.failed, 0, sizeof unit.failed);
   unit.reading_mdeg = kept.reading_mdeg;
   begin_row(step, 0, 0);
 }
@@ -244,8 +240,8 @@ void kind_switch(const struct step *step) {
   if (step->action == ROTATE) {
     bank_all_off();
     turn(row->reading_mdeg);
-  } else {
-    start_pattern(row->pattern, level_of(row), NEVER);
+  } else if (!start_pattern(row->pattern, level_of(row), NEVER)) {
+    box_go_dark();
   }
 }
 

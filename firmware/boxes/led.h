@@ -54,7 +54,10 @@ us_t bank_deadline(void);
 bool bank_advance(void); /* false: a driver has tripped, LED:HOT was said */
 /* Put out what is due, while a long judgment lets no time pass for the core. */
 void bank_keep_ends(void);
-bool bank_switch_on(uint16_t led, double level, us_t end); /* false: it draws no current */
+/* false: it is newly found to draw no current, LED:FAIL was said; it is not driven again */
+bool bank_switch_on(uint16_t led, double level, us_t end);
+bool bank_has_failed(uint16_t led);
+void bank_forget_failed(void);
 void bank_switch_off(uint16_t led);
 void bank_all_off(void);
 /* Pulses since a time, and those in progress that have an end. */

@@ -17,7 +17,7 @@ static KEPT struct {
 static STATE struct {
   double level[LEDS];
   us_t since[LEDS], end[LEDS];
-  bool lit[LEDS];
+  bool lit[LEDS], failed[LEDS];
   uint16_t order[LEDS], count; /* lit LEDs, as they came on */
 } bank;
 
@@ -32,6 +32,8 @@ void bank_build(void) {
 }
 
 bool bank_is_lit(uint16_t led) { return bank.lit[led]; }
+bool bank_has_failed(uint16_t led) { return bank.failed[led]; }
+void bank_forget_failed(void) { memset(bank.failed, 0, sizeof bank.failed); }
 bool bank_any_lit(void) { return bank.count > 0; }
 double bank_dose_ws(uint16_t led) { return kept.dose_ws[led]; }
 void bank_new_subject(void) { memset(kept.dose_ws, 0, sizeof kept.dose_ws); }
@@ -106,7 +108,13 @@ void bank_keep_ends(void) {
 
 bool bank_switch_on(uint16_t led, double level, us_t end) {
   bank_switch_off(led);
-  if (!board_set_led(led, level)) return false;
+  if (bank.failed[led]) return true;
+  if (!board_set_led(led, level)) {
+    bank.failed[led] = true;
+    put_int(event_start(P("LED:FAIL")), led);
+    event_end();
+    return false;
+  }
   if (level > 0.0) {
     heat_until_now();
     bank.lit[led] = true;

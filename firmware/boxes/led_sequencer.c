@@ -5,6 +5,7 @@
 #include "boxes/led.h"
 
 #define FLICKER_HISTORY_US 1000000
+#define FLICKER_FUSION_US 15385 /* shortest darkness that an eye perceives */
 #define JUDGE_US 1000
 #define JUDGE_MAX_US 1900000 /* the host gives up after 2 s */
 #define ALL_CAMERAS ((uint32_t)((UINT64_C(1) << CAMERAS) - 1u))
@@ -41,6 +42,7 @@ static void forget_steps(void) {
 void sequencer_reset(bool power_up) {
   (void)power_up;
   box_go_dark();
+  bank_forget_failed();
   us_t judged_at = unit.judged_at; /* an answer may still be due */
   bool darkened = unit.darkened;
   memset(&unit, 0, sizeof unit);
@@ -230,8 +232,13 @@ COMMAND(get_seq_crc) {
   return CODE_OK;
 }
 
+/* How far light of before is moved back: a table may begin at any time after SEQ:ARM. */
+static us_t past_gap;
+
 static void visit_past(const struct pulse *pulse, void *context) {
-  if (pulse->on < core_now()) (*(visit_pulse **)context)(pulse, NULL);
+  if (pulse->on >= core_now()) return;
+  struct pulse moved = {pulse->level, pulse->on - past_gap, pulse->off - past_gap, pulse->led};
+  (*(visit_pulse **)context)(&moved, NULL);
 }
 
 static void past_light(int32_t only, visit_pulse *visit, void *context) {
@@ -261,6 +268,7 @@ static enum code require_no_flicker(void) {
 }
 
 enum code require_flicker_limits(requested_light *light) {
+  past_gap = 0;
   guard_start(past_light, light);
   while (guard_continue()) {
   }
@@ -294,7 +302,9 @@ COMMAND(do_seq_arm) {
   if (rows != unit.rows) return refuse_above(P("the table has "), unit.rows, P(" rows"));
   TRY(refuse_open_stop());
   TRY(kind_require_ready());
+  bank_all_off(); /* else light whose end is not known would precede the table */
   TRY(bank_require_within_limits(table_light, &unit.loads));
+  past_gap = FLICKER_FUSION_US;
   guard_start(past_light, table_light);
   unit.darkened = unit.late = false;
   unit.judging = true;
@@ -304,13 +314,10 @@ COMMAND(do_seq_arm) {
 }
 
 COMMAND(do_trig) {
-  struct loads loads;
   TRY(parse_token(arguments));
   TRY(refuse_running());
   TRY(refuse_open_stop());
   if (!unit.armed) return refuse(CODE_NOT_ARMED, P("SEQ:ARM checks the table first"));
-  TRY(kind_require_ready());
-  TRY(bank_require_within_limits(table_light, &loads));
   unit.armed = false;
   bank_all_off();
   forget_steps();
@@ -406,6 +413,19 @@ COMMAND(get_safe_eyes) {
   put_flash(answer, unit.eyes == EYES_OPEN     ? P("OPEN")
                     : unit.eyes == EYES_CLOSED ? P("CLOSED")
                                                : P("SHIELDED"));
+  return CODE_OK;
+}
+
+COMMAND(get_led_fail) {
+  UNUSED;
+  for (uint16_t digits = (LEDS + 3) / 4; digits--;) {
+    uint8_t digit = 0;
+    for (uint8_t k = 0; k < 4; k++) {
+      uint16_t led = (uint16_t)(4 * digits + k);
+      if (led < LEDS && bank_has_failed(led)) digit |= (uint8_t)(1u << k);
+    }
+    put_hex(answer, digit, 1, true);
+  }
   return CODE_OK;
 }
 

@@ -29,7 +29,7 @@ from rigsim.boxes.command import (
 from rigsim.boxes.device import Device
 
 FIRMWARE_VERSION = "1.0"
-PROTOCOL_MINOR = 2
+PROTOCOL_MINOR = 3
 """Revision of the protocol's text; a controller without it in its limits is of revision 0."""
 MAX_CACHED_REPLIES = 8
 MAX_REMEMBERED_HELLOS = 8

@@ -6,9 +6,9 @@ row's LEDs come on shortly before the last row's go off, the cameras of the row'
 once its light is steady, and each release is reported as an event ``SEQ:STEP``. A table, and every
 ``LED:ON``, is refused beyond the duty (101), heat (102) or dose (104) limit of an LED. Until the
 operator has confirmed that the subject's eyes are closed or shielded, it is also refused beyond the
-flicker limit for open eyes (105). Each command of light includes its end. LEDs that draw no current
-are refused with -240, or reported as ``LED:FAIL`` in a sequence. Heat, dose and duty survive a
-reset.
+flicker limit for open eyes (105). Each command of light includes its end. An LED that draws no
+current is refused with -240; it ends a sequence, see `rigsim.boxes.led_sequencer`. Heat, dose and
+duty survive a reset.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,8 @@ class DomeUnit(LedSequencer[LedTableRow]):
         )
 
     def _pulses_from_table(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
-        return led_table.pulses_from_rows(rows, now, overlap_s=self._limits.overlap_s)
+        pulses = led_table.pulses_from_rows(rows, now, overlap_s=self._limits.overlap_s)
+        return [pulse for pulse in pulses if pulse.led not in self.bank.failed]
 
     def _schedule(self, rows: Sequence[LedTableRow]) -> list[SequenceEvent]:
         limits = self._limits
@@ -93,9 +94,8 @@ class DomeUnit(LedSequencer[LedTableRow]):
             self._turn_on([k for k in row.leds if k in held.leds], row.level, now)
 
     def _turn_on(self, leds: Sequence[int], level: float, now: float) -> None:
-        for led in leds:
-            if not self.bank.switch_on(led, level, now):
-                self.queue_event("LED:FAIL", str(led))
+        if not self._switch_on(dict.fromkeys(leds, level), now):
+            self.go_dark(now)
 
     def light_now(self, now: float) -> list[LedPulse]:
         """Return the intervals of light in progress, as emitted so far."""
@@ -123,7 +123,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
                 Code.OUT_OF_RANGE, f"more than {self._limits.max_at_once} LEDs at once"
             )
         self._require_closed_stop()
-        dead = [led for led in leds if led in self.bank.dead]
+        dead = [led for led in leds if not self.bank.draws_current(led, now)]
         if dead:
             raise CommandRefused(Code.HARDWARE, f"LED {dead[0]} draws no current")
         end_s = add_us(now, span_us)
@@ -131,8 +131,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
         self.bank.require_within_limits(wanted, now)
         self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
-        for led in leds:
-            self.bank.switch_on(led, level, now, end_s=end_s)
+        self._switch_on(dict.fromkeys(leds, level), now, end_s=end_s)
 
     def _put_out(self, arguments: str, now: float) -> None:
         leds = self.bank.lit if arguments.upper() == "ALL" else self._leds(arguments)

@@ -84,6 +84,8 @@ class Faults:
     """Heat of the drivers of lamps and LEDs at power-up, 0 to 1; the flash's trips at 0.8."""
     led_dead: str = ""
     """Numbers of LEDs that draw no current, joined by +."""
+    led_dead_after: Seconds = 0.0
+    """These LEDs fail when they are first switched on at this time after power-up, or later, s."""
     led_weak: str = ""
     """LEDs that emit less light than they are driven for: number=fraction, joined by +."""
     misfire: Probability = 0.0
@@ -163,6 +165,17 @@ class Faults:
     def dead_leds(self) -> frozenset[int]:
         """Numbers of the dead LEDs."""
         return frozenset(_led_number("led_dead", part) for part in self.led_dead.split("+") if part)
+
+    def is_led_dead(self, led: int, now_s: float) -> bool:
+        """Return whether an LED that is switched on at a time, in s, draws no current.
+
+        Examples
+        --------
+        >>> broken = Faults(led_dead="3", led_dead_after=5.0)
+        >>> broken.is_led_dead(3, 4.9), broken.is_led_dead(3, 5.0), broken.is_led_dead(4, 5.0)
+        (False, True, False)
+        """
+        return now_s >= self.led_dead_after and led in self.dead_leds
 
     @property
     def weak_leds(self) -> dict[int, float]:

@@ -7,8 +7,8 @@ readings of the analyzer, see `rigsim.boxes.led_sequencer`, and the controller s
 autonomously. Where a row requests another reading than the row before, the light goes out, the
 analyzer turns, and only then the row's light comes on. Outside of scans, light while the analyzer
 turns and turning in the light are refused (-213). Gains scale the level of each LED relative to the
-pattern's. LEDs that draw no current are reported as ``LED:FAIL``. The controller does not detect
-LEDs that emit less light than they are driven for.
+pattern's. An LED that draws no current ends a scan, and is reported as ``LED:FAIL``. The controller
+does not detect LEDs that emit less light than they are driven for.
 """
 
 import math
@@ -81,7 +81,6 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         health = np.ones(len(rig.lights))
         for led, share in faults.weak_leds.items():
             health[led] = share
-        health[list(faults.dead_leds)] = 0.0
         self._health = health
         self._shining: PatternLight | None = None  # light in progress; its end is not known yet
         self.analyzer_deg = 0.0
@@ -94,7 +93,6 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         super().reset(now, power_up=power_up)
         self.gains = [LEVEL_STEPS] * self.bank.count
         self._gains_sent: list[int] = []
-        self._failed: set[int] = set()
         self._turn(0.0, now)
 
     def capabilities(self) -> Mapping[str, Any]:
@@ -183,25 +181,26 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
 
     def _start_pattern(
         self, pattern: str, level: float, now: float, *, end_s: float = math.inf
-    ) -> None:
-        """Replace the light in progress by a pattern."""
+    ) -> bool:
+        """Replace the light in progress by a pattern; return False when an LED is found dead."""
         self.bank.all_off(now)
         if pattern == "dark":
-            return
-        for led, driven in enumerate(self._levels(pattern, level)):
-            if not self.bank.switch_on(led, driven, now, end_s=end_s) and led not in self._failed:
-                self._failed.add(led)
-                self.queue_event("LED:FAIL", str(led))
+            return True
+        works = self._switch_on(dict(enumerate(self._levels(pattern, level))), now, end_s=end_s)
         shares = np.array(self.gains) / LEVEL_STEPS * self._health
+        shares[list(self.bank.failed)] = 0.0
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyzer_deg, given)
+        return works
 
     def _requested_pulses(
         self, pattern: str, level: float, on_s: float, off_s: float
     ) -> list[LedPulse]:
         levels = self._levels(pattern, level)
         return [
-            LedPulse(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0
+            LedPulse(led, driven, on_s, off_s)
+            for led, driven in enumerate(levels)
+            if driven > 0.0 and led not in self.bank.failed
         ]
 
     def _light(self, arguments: str, now: float) -> None:
@@ -227,7 +226,6 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self.bank.require_within_limits(wanted, now)
         self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
-        self._failed = set()
         self._start_pattern(pattern, level, now, end_s=end_s)
 
     def _lit_now(self, _: str, now: float) -> str:
@@ -254,7 +252,6 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         return found
 
     def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[SequenceEvent]:
-        self._failed = set()
         return led_table.schedule_pattern_rows(
             rows,
             reading_deg=self.analyzer_deg,
@@ -269,8 +266,8 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         if switch.action == "rotate":
             self.bank.all_off(now)
             self._turn(row.analyzer_deg, now)
-        else:
-            self._start_pattern(row.pattern, row.level, now)
+        elif not self._start_pattern(row.pattern, row.level, now):
+            self.go_dark(now)
 
     # gains ------------------------------------------------------------------------------------
 

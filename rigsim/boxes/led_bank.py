@@ -54,12 +54,19 @@ class LedBank:
         Called with each interval of light when it ends: LED, level, start and end in s.
     faults
         Dead LEDs; weak LEDs, which the driver does not detect; and the heat of all at power-up.
+
+    Attributes
+    ----------
+    failed : set of int
+        Numbers of the LEDs that have been found to draw no current since the last reset; they are
+        not driven again.
     """
 
     def __init__(self, rig: Rig, faults: Faults, on_light: Callable[[LedPulse], None]) -> None:
         lights, limits = rig.lights, rig.leds or LedLimits()
         self.limits = limits
-        self.dead = faults.dead_leds
+        self.failed: set[int] = set()
+        self._dead, self._dead_from_s = faults.dead_leds, faults.led_dead_after
         self.count = len(lights)
         self._power_w = np.array([light.power_w or 0.0 for light in lights])
         self._weak = faults.weak_leds
@@ -131,10 +138,17 @@ class LedBank:
 
     # switching --------------------------------------------------------------------------------
 
+    def draws_current(self, led: int, now: float) -> bool:
+        """Return whether an LED would be lit by `switch_on`."""
+        return led not in self.failed and not (led in self._dead and now >= self._dead_from_s)
+
     def switch_on(self, led: int, level: float, now: float, *, end_s: float = math.inf) -> bool:
-        """Light an LED until `end_s`; return False when it draws no current."""
+        """Light an LED until `end_s`; return False when it is newly found to draw no current."""
         self.switch_off(led, now)
-        if led in self.dead:
+        if led in self.failed:
+            return True
+        if not self.draws_current(led, now):
+            self.failed.add(led)
             return False
         if level > 0.0:
             self._heat_until(now)

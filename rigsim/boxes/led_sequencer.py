@@ -5,12 +5,17 @@ steps autonomously, releases the cameras of a row's mask once its light is stead
 release as an event ``SEQ:STEP``. Light is refused beyond the duty (101), heat (102) or dose (104)
 limit of an LED. Until the operator has confirmed that the subject's eyes are closed or shielded, it
 is also refused beyond the flicker limit for open eyes (105). Heat, dose and duty survive a reset.
+
+A table is judged as if its LEDs were lit. Where one is found to draw no current, the sequence ends
+in darkness (``LED:FAIL``, ``SEQ:STOP``). Until the next reset the LED is neither driven nor judged
+as lit; ``LED:FAIL?`` lists such LEDs.
 """
 
+import math
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
@@ -40,6 +45,8 @@ from rigsim.boxes.led_table import (
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_RANGE_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
+FLICKER_FUSION_US = 15_385
+"""Shortest darkness that an eye perceives, us."""
 FLICKER_HISTORY_S = 1.0
 """Past interval whose light is evaluated together with the requested light, s."""
 
@@ -113,6 +120,7 @@ class LedSequencer(Device, Generic[RowT]):
         self.table: list[RowT] = []
         self.mask = (1 << self._cameras) - 1
         self.eyes = "OPEN"
+        self.bank.failed.clear()
         self._sequence_armed = False
         self._run = None
         self._steps: dict[int, int] = {}
@@ -158,6 +166,7 @@ class LedSequencer(Device, Generic[RowT]):
             "CAM:TRIG": self._release,
             "SAFE:EYES": self._set_eyes,
             "SAFE:EYES?": lambda *_: self.eyes,
+            "LED:FAIL?": self._list_failed,
             "DOSE?": self._dose,
             "DOSE:NEW": self._new_subject,
         }
@@ -188,6 +197,17 @@ class LedSequencer(Device, Generic[RowT]):
         if tripped:
             self._events += [("LED:HOT", str(led)) for led in tripped]
             self.go_dark(now)
+
+    def _switch_on(self, leds: Mapping[int, float], now: float, *, end_s: float = math.inf) -> bool:
+        """Light LEDs at their levels; report those newly found dead, and return False for any."""
+        found = [
+            led
+            for led, level in leds.items()
+            if not self.bank.switch_on(led, level, now, end_s=end_s)
+        ]
+        for led in found:
+            self.queue_event("LED:FAIL", str(led))
+        return not found
 
     def _switch(self, run: SequenceRun[RowT], switch: SequenceEvent, now: float) -> None:
         if switch.action == "pulse":
@@ -269,8 +289,9 @@ class LedSequencer(Device, Generic[RowT]):
             raise CommandRefused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
         self._require_closed_stop()
         wanted = self._pulses_from_table(self.table, now)
+        self.bank.all_off(now)  # else light whose end is not known would precede the table
         duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
-        flicker = self._flicker(wanted, now)
+        flicker = self._flicker(wanted, now, gap_us=FLICKER_FUSION_US)
 
         def conclude() -> str:
             flashes, rms = self._require_no_flicker(*flicker)
@@ -296,10 +317,19 @@ class LedSequencer(Device, Generic[RowT]):
         """Return flashes per second and rms of the request, or refuse it for open eyes."""
         return self._require_no_flicker(*self._flicker(wanted, now))
 
-    def _flicker(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
-        """Return flashes per second, with those of the last second, and rms of the request."""
+    def _flicker(
+        self, wanted: Sequence[LedPulse], now: float, *, gap_us: int = 0
+    ) -> tuple[float, float]:
+        """Return flashes per second, with those of the last second, and rms of the request.
+
+        Light of the last second is moved `gap_us` back: a table may begin at any time after this.
+        """
         past = [
-            pulse for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S) if pulse.t_on_s < now
+            replace(
+                pulse, t_on_s=add_us(pulse.t_on_s, -gap_us), t_off_s=add_us(pulse.t_off_s, -gap_us)
+            )
+            for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S)
+            if pulse.t_on_s < now
         ]
         return self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
 
@@ -319,8 +349,6 @@ class LedSequencer(Device, Generic[RowT]):
         CommandRefused.raise_if(
             not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM checks the table first"
         )
-        # light in progress at SEQ:ARM, or switched on after it, has been emitted by now
-        self.bank.require_within_limits(self._pulses_from_table(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)
@@ -362,6 +390,10 @@ class LedSequencer(Device, Generic[RowT]):
     def _set_eyes(self, arguments: str, now: float) -> None:
         self.eyes = parse_choice(arguments, EYE_STATES)
         self._sequence_armed = False
+
+    def _list_failed(self, _: str, now: float) -> str:
+        mask = sum(1 << led for led in self.bank.failed)
+        return f"{mask:0{-(-self.bank.count // 4)}X}"
 
     def _dose(self, arguments: str, now: float) -> str:
         return f"{self.bank.dose_ws(parse_integer(arguments, 0, self.bank.count - 1)):.6f}"

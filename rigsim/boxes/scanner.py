@@ -244,7 +244,7 @@ class ScannerUnit(Device):
         self._require_closed_stop()
         self._require_dark(now)
         CommandRefused.raise_if(self.eyes == "OPEN", Code.FLICKER)
-        dead = self.projector in self.faults.dead_leds
+        dead = self.faults.is_led_dead(self.projector, now)
         why = f"the lamp of projector {self.projector} draws no current"
         CommandRefused.raise_if(dead, Code.HARDWARE, why)
         projector = self._scanner.projectors[self.projector]

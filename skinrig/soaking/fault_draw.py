@@ -21,6 +21,10 @@ MAX_CLOCK_JUMP_S = 7200.0
 WEAK_LED_SHARE = 0.3
 """Days of a rig with an LED that emits less than requested, relative to all."""
 
+DYING_LED_SHARE = 0.5
+"""Dead LEDs that have worked before, relative to all."""
+MAX_LED_LIFE_S = 7200.0
+
 LATE_FRAME_SHARE = 0.1
 """Days of a rig with late and repeated frames, relative to all."""
 MAX_LATE_FRAME_S = 12.0
@@ -107,4 +111,6 @@ def draw_rig_faults(rng: np.random.Generator, lights: int) -> Faults:
     if own.random() < LATE_FRAME_SHARE:
         drawn |= {"late_frame": 0.1, "repeat_frame": 0.1}
         drawn["late_frame_s"] = float(own.uniform(1.0, MAX_LATE_FRAME_S))
+    if "led_dead" in drawn and own.random() < DYING_LED_SHARE:
+        drawn["led_dead_after"] = float(own.uniform(0.0, MAX_LED_LIFE_S))
     return Faults(**drawn)

@@ -16,6 +16,7 @@ from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
 from rigsim.boxes.led_table import LEVEL_STEPS, LedTableRow, table_crc
+from skinrig.soaking.light_limits import find_limit_violations
 
 WHOLE = load_rig("dome")
 RIG = DOME.rig
@@ -241,16 +242,42 @@ def test_duty_counts_light_of_before_the_table(bench):
     assert bench.code("SEQ:ARM 1") == Code.DUTY
 
 
-def test_light_running_at_arming_counts_toward_table(bench):
+def test_light_running_at_arming_goes_out_and_counts(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.ask("SYST:ARM")
     bench.ask("SEQ:DEF 0,17:1000:40000:7")
     bench.ask("LED:ON 17,240")
-    bench.ask("SEQ:ARM 1")
-    bench.wait(0.3)
-    assert bench.code("TRIG r1") == Code.DUTY
+    bench.wait(0.22)
+    assert bench.code("SEQ:ARM 1") == Code.DUTY
+    assert not bench.unit.lit
     bench.wait(1.0)
+    bench.ask("LED:ON 17,100")
+    bench.wait(0.05)
+    assert float(bench.ask("SEQ:ARM 1").split(",")[2]) == pytest.approx(0.09, abs=1e-3)
+    assert not bench.unit.lit
     bench.ask("TRIG r2")
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.05, 0.25, 0.4])
+def test_pause_before_trigger_adds_no_uncounted_flash(bench, pause_s):
+    """Light just before SEQ:ARM is a flash of its own if the table begins later."""
+    lit, *others = front(6)
+    rows = [LedTableRow((lit,), LEVEL_STEPS, 60_000, 7), LedTableRow((), 0, 60_000, 0)] * 2
+    rows += rows_of(others[1:], ms=200)
+    bench.ask("SYST:ARM")
+    bench.ask("SYST:WDOG 5000")
+    bench.load(rows)
+    assert float(bench.ask(f"SEQ:ARM {len(rows)}").split(",")[0]) == 2.5
+    bench.ask(f"LED:ON {others[0]},50")
+    bench.wait(0.03)
+    assert bench.code(f"SEQ:ARM {len(rows)}") == Code.FLICKER
+    bench.wait(1.1)
+    assert bench.code(f"SEQ:ARM {len(rows)}") == Code.OK
+    bench.wait(pause_s)
+    bench.ask("TRIG r1")
+    bench.wait(3.0)
+    emitted = {"pops": [], "switched": bench.world.switched, "eyes": "open"}
+    assert list(find_limit_violations(RIG, **emitted)) == []
 
 
 def test_led_warms_as_rc_circuit_and_trips():
@@ -367,16 +394,60 @@ def test_planned_order_is_accepted_and_bad_order_refused():
 # faults ---------------------------------------------------------------------------------------
 
 
-def test_dead_led_is_refused_singly_reported_in_sequence():
-    a, b = behind(2)
+def failed_in(bench):
+    """Numbers of the LEDs that the box lists as failed."""
+    mask = bench.ask("LED:FAIL?")
+    assert len(mask) == 38
+    return {led for led in range(150) if int(mask, 16) >> led & 1}
+
+
+def test_dead_led_ends_sequence_and_stays_dark():
+    a, b, c = behind(3)
     bench = DOME.bench(led_dead=str(b))
     bench.ask("SYST:ARM")
     assert bench.code(f"LED:ON {b},50") == Code.HARDWARE
-    bench.run(rows_of([a, b]))
+    assert failed_in(bench) == set()
+    bench.run(rows_of([a, b, c]))
     bench.wait(0.3)
-    assert ("LED:FAIL", str(b)) in bench.said
-    assert [pulse.led for pulse in bench.world.switched] == [a]
-    assert len(bench.edges) == 2
+    assert bench.said[-2][:2] == ("LED:FAIL", str(b))
+    assert bench.said[-1][0] == "SEQ:STOP"
+    assert bench.ask("SEQ:POS?") == "STOP,0,3,r1"
+    assert failed_in(bench) == {b}
+    assert not bench.unit.lit
+    bench.run(rows_of([a, b, c]), "r2")
+    bench.wait(0.3)
+    assert bench.ask("SEQ:POS?") == "DONE,2,3,r2"
+    assert [pulse.led for pulse in bench.world.switched] == [a, a, c]
+    assert len(bench.edges) == 1 + 3
+    assert bench.events("LED:FAIL") == [str(b)]
+    assert bench.code(f"LED:ON {b},50") == Code.HARDWARE
+    bench.ask("*RST")
+    assert failed_in(bench) == set()
+
+
+def test_all_dead_leds_of_row_are_found_together():
+    a, b, c = sorted(behind(3))
+    bench = DOME.bench(led_dead=f"{a}+{c}")
+    bench.run([LedTableRow((a, b, c), LEVEL_STEPS, 50_000, 7)])
+    assert bench.ask("SEQ:POS?") == "STOP,-1,1,r1"
+    assert failed_in(bench) == {a, c}
+    assert (bench.world.switched, bench.edges) == ([], [])
+
+
+def test_failed_led_is_judged_as_dark_row():
+    """All lit, the rows give even light; each dark row between lit ones is a flash."""
+    lit, dead = front(2)
+    bench = DOME.bench(led_dead=str(dead))
+    rows = rows_of([lit, dead] * 6, ms=60, level=300)
+    bench.ask("SYST:ARM")
+    bench.load(rows)
+    assert float(bench.ask("SEQ:ARM 12").split(",")[0]) <= 1.0
+    bench.ask("TRIG r1")
+    bench.wait(2.0)
+    assert bench.ask("SEQ:POS?") == "STOP,0,12,r1"
+    assert bench.code("SEQ:ARM 12") == Code.FLICKER
+    bench.ask("SAFE:EYES CLOSED")
+    assert float(bench.ask("SEQ:ARM 12").split(",")[0]) > 3.0
 
 
 def test_weak_led_emits_less_than_driven_without_detection():

@@ -186,6 +186,22 @@ def test_a_dead_led_is_named():
     world.unregister()
 
 
+@pytest.mark.parametrize("minor", [2, 3])
+def test_dead_led_is_queried_from_newer_controllers(minor):
+    world = World(RIG, seed=5, faults=Faults(led_dead=str(UNSEEN[1])))
+    name = world.register(next(NAMES))
+    with DomeBox(Port(f"sim://dome?world={name}", clock=world.clock)) as box:
+        box._limits = {**box.limits, "protocol_minor": minor}
+        box.arm()
+        box.load(rows(UNSEEN[:3]))
+        box.arm_sequence(3)
+        box.trigger("r")
+        world.clock.sleep(0.3)  # the event is not read
+        box.find_failed_leds()
+        assert box.failed_leds == ({UNSEEN[1]} if minor == 3 else set())
+    world.unregister()
+
+
 def test_slow_judgment_is_awaited_with_retries():
     world = World(RIG, seed=5, faults=Faults(slow_judgment=1.7))
     name = world.register(next(NAMES))

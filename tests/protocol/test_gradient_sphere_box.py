@@ -362,18 +362,26 @@ def test_reset_clears_table_gains_and_eye_state(bench, forget):
     assert bench.ask("*OPC?") == "0"  # on its way back
 
 
-def test_dead_led_is_reported_once_weak_led_never():
+def test_dead_led_ends_one_scan_weak_led_none():
     bench = GRADIENT_SPHERE.bench(led_dead="5", led_weak="9=0.25")
     bench.run(rows_of(["x", "-x"]))
+    assert bench.ask("SEQ:POS?") == "STOP,-1,2,r1"
+    assert int(bench.ask("LED:FAIL?"), 16) == 1 << 5
+    assert bench.world.switched == []
+    bench.run(rows_of(["x", "-x"]), "r2")
     bench.wait(0.3)
     assert bench.events("LED:FAIL") == ["5"]
     assert len(bench.world.switched) == 2
     for light in bench.world.switched:
         assert len(light.led_shares) == LEDS
         assert {k: s for k, s in enumerate(light.led_shares) if s != 1.0} == {5: 0.0, 9: 0.25}
-    bench.run(rows_of(["y"]), "r2")
-    bench.wait(0.3)
+    bench.ask("*RST")
+    bench.wait(1.0)
+    bench.ask("SYST:ARM")
+    bench.ask("PATT Y,50")  # one light is not ended
+    bench.wait(0.1)
     assert bench.events("LED:FAIL") == ["5", "5"]
+    assert len(bench.world.switched) == 3
 
 
 def test_the_emergency_stop_is_reported_and_nothing_lights():

@@ -12,7 +12,7 @@
 #endif
 #define BOX_FIRMWARE "1.0"
 #define BOX_PROTOCOL "1"
-#define BOX_CAPABILITIES "{\"kind\":\"caliper\",\"protocol\":1,\"protocol_minor\":2,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"step_min\":-4,\"step_max\":8,\"step_mm\":0.8,\"aperture_mm\":8.0,\"angles_deg\":[0.0,45.0,90.0,135.0],\"speed_mm_per_s\":2.0,\"turn_deg_per_s\":90.0,\"force_limit_min_n\":0.05,\"force_limit_max_n\":10.0,\"control_period_ms\":5.0}"
+#define BOX_CAPABILITIES "{\"kind\":\"caliper\",\"protocol\":1,\"protocol_minor\":3,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"step_min\":-4,\"step_max\":8,\"step_mm\":0.8,\"aperture_mm\":8.0,\"angles_deg\":[0.0,45.0,90.0,135.0],\"speed_mm_per_s\":2.0,\"turn_deg_per_s\":90.0,\"force_limit_min_n\":0.05,\"force_limit_max_n\":10.0,\"control_period_ms\":5.0}"
 
 #define STEP_MIN (-4)
 #define STEP_MAX 8

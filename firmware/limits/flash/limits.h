@@ -12,7 +12,7 @@
 #endif
 #define BOX_FIRMWARE "1.0"
 #define BOX_PROTOCOL "1"
-#define BOX_CAPABILITIES "{\"kind\":\"flash\",\"protocol\":1,\"protocol_minor\":2,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"power_min\":0.00390625,\"power_max\":1.0,\"analyser_min_deg\":0.0,\"analyser_max_deg\":180.0,\"sync_min_us\":0.0,\"sync_max_us\":50000.0,\"led_min_nm\":420.0,\"led_max_nm\":680.0,\"lamp_min_ms\":1.0,\"lamp_max_ms\":500.0,\"recycle_s\":1.5,\"pops_per_min\":20,\"move_s_per_deg\":0.005556}"
+#define BOX_CAPABILITIES "{\"kind\":\"flash\",\"protocol\":1,\"protocol_minor\":3,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"power_min\":0.00390625,\"power_max\":1.0,\"analyser_min_deg\":0.0,\"analyser_max_deg\":180.0,\"sync_min_us\":0.0,\"sync_max_us\":50000.0,\"led_min_nm\":420.0,\"led_max_nm\":680.0,\"lamp_min_ms\":1.0,\"lamp_max_ms\":500.0,\"recycle_s\":1.5,\"pops_per_min\":20,\"move_s_per_deg\":0.005556}"
 
 #define RECYCLE_US 1500000
 #define POPS_PER_MIN 20

@@ -12,7 +12,7 @@
 #endif
 #define BOX_FIRMWARE "1.0"
 #define BOX_PROTOCOL "1"
-#define BOX_CAPABILITIES "{\"kind\":\"gradient_sphere\",\"protocol\":1,\"protocol_minor\":2,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"leds\":132,\"cameras\":1,\"max_rows\":64,\"row_min_us\":2000,\"row_max_us\":500000,\"level_steps\":1000,\"max_at_once\":132,\"led_max_ms\":500.0,\"max_duty\":0.25,\"duty_window_s\":1.0,\"thermal_tau_s\":4.0,\"thermal_trip\":0.6,\"dose_ws\":50.0,\"max_flashes_per_s\":3.0,\"max_flicker_rms\":0.25,\"overlap_us\":100,\"settle_us\":1000,\"analyser_min_deg\":0.0,\"analyser_max_deg\":180.0,\"move_s_per_deg\":0.001666667}"
+#define BOX_CAPABILITIES "{\"kind\":\"gradient_sphere\",\"protocol\":1,\"protocol_minor\":3,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"leds\":132,\"cameras\":1,\"max_rows\":64,\"row_min_us\":2000,\"row_max_us\":500000,\"level_steps\":1000,\"max_at_once\":132,\"led_max_ms\":500.0,\"max_duty\":0.25,\"duty_window_s\":1.0,\"thermal_tau_s\":4.0,\"thermal_trip\":0.6,\"dose_ws\":50.0,\"max_flashes_per_s\":3.0,\"max_flicker_rms\":0.25,\"overlap_us\":100,\"settle_us\":1000,\"analyser_min_deg\":0.0,\"analyser_max_deg\":180.0,\"move_s_per_deg\":0.001666667}"
 
 #define LEDS 132
 #define CAMERAS 1
@@ -72,6 +72,7 @@ static const FLASH double PATTERN_SHARE[7][LEDS] = {
   X(do_cam_trig, "CAM:TRIG", "<token>", 0, "") \
   X(do_safe_eyes, "SAFE:EYES", "OPEN|CLOSED|SHIELDED", 0, "") \
   X(get_safe_eyes, "SAFE:EYES?", "", 0, "") \
+  X(get_led_fail, "LED:FAIL?", "", 0, "") \
   X(get_dose, "DOSE?", "<led>", 0, "") \
   X(do_dose_new, "DOSE:NEW", "<token>", 0, "") \
   X(do_seq_def, "SEQ:DEF", "<first>,<pattern>:<deg>:<level>:<us>:<mask>;...", 0, "") \

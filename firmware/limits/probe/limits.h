@@ -12,7 +12,7 @@
 #endif
 #define BOX_FIRMWARE "1.0"
 #define BOX_PROTOCOL "1"
-#define BOX_CAPABILITIES "{\"kind\":\"probe\",\"protocol\":1,\"protocol_minor\":2,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"fibres\":28,\"level_steps\":1000,\"shutter_min_ms\":1.0,\"shutter_max_ms\":30000.0,\"shutter_lag_ms\":1.0,\"cover_ms\":300.0,\"suction_min_mbar\":10.0,\"suction_max_mbar\":150.0,\"suction_min_ms\":100.0,\"suction_max_ms\":60000.0,\"reach_ms\":2000.0,\"rest_ms\":5000.0,\"control_period_ms\":50.0,\"camera_c\":5.0,\"source_w\":0.001,\"dose_ws\":10.0}"
+#define BOX_CAPABILITIES "{\"kind\":\"probe\",\"protocol\":1,\"protocol_minor\":3,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"fibres\":28,\"level_steps\":1000,\"shutter_min_ms\":1.0,\"shutter_max_ms\":30000.0,\"shutter_lag_ms\":1.0,\"cover_ms\":300.0,\"suction_min_mbar\":10.0,\"suction_max_mbar\":150.0,\"suction_min_ms\":100.0,\"suction_max_ms\":60000.0,\"reach_ms\":2000.0,\"rest_ms\":5000.0,\"control_period_ms\":50.0,\"camera_c\":5.0,\"source_w\":0.001,\"dose_ws\":10.0}"
 
 #define FIBERS 28
 #define SHUTTER_MAX_US 30000000

@@ -12,7 +12,7 @@
 #endif
 #define BOX_FIRMWARE "1.0"
 #define BOX_PROTOCOL "1"
-#define BOX_CAPABILITIES "{\"kind\":\"scanner\",\"protocol\":1,\"protocol_minor\":2,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"projectors\":2,\"cameras\":4,\"columns\":[800,800],\"rows\":[1280,1280],\"period_px\":32,\"phase_steps\":6,\"settle_ms\":20.0,\"min_show_ms\":1.0,\"max_show_ms\":500.0,\"dose_ws\":50.0}"
+#define BOX_CAPABILITIES "{\"kind\":\"scanner\",\"protocol\":1,\"protocol_minor\":3,\"lease_min_ms\":300,\"lease_max_ms\":5000,\"projectors\":2,\"cameras\":4,\"columns\":[800,800],\"rows\":[1280,1280],\"period_px\":32,\"phase_steps\":6,\"settle_ms\":20.0,\"min_show_ms\":1.0,\"max_show_ms\":500.0,\"dose_ws\":50.0}"
 
 #define PROJECTORS 2
 #define CAMERAS 4

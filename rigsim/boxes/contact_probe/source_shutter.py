@@ -68,7 +68,7 @@ class SourceShutter:
         self.dose_limit_ws = (rig.leds or LedLimits()).dose_ws
         self._on_light, self._on_open = wiring.on_light, wiring.on_trigger
         self._stuck, self._jam = faults.shutter_stuck, faults.shutter_jam
-        self._dead = 0 in faults.dead_leds
+        self._faults = faults
         self._weak = faults.weak_leds.get(0, 1.0)
         self._opening: _Opening | None = None
         self._light_since: float | None = None
@@ -241,7 +241,8 @@ class SourceShutter:
             CommandRefused.raise_if(
                 self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE"
             )
-            CommandRefused.raise_if(self._dead, Code.HARDWARE, "the LED draws no current")
+            dead = self._faults.is_led_dead(0, now)
+            CommandRefused.raise_if(dead, Code.HARDWARE, "the LED draws no current")
             self.level = level
         else:
             self._put_out(now)

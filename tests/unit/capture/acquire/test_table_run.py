@@ -1,8 +1,10 @@
 """Clocks of cameras whose link is lost around the arming of a table."""
 
+from types import SimpleNamespace
+
 import pytest
 
-from capture.acquire.table_run import arm_camera
+from capture.acquire.table_run import arm_camera, count_attempts
 from capture.devices.camera import FrameRefused
 
 
@@ -35,3 +37,12 @@ def test_armed_camera_has_clock_of_its_link(lost_at):
     clock = arm_camera(camera, 7, lambda: 100.0)
     assert clock.offset_s == camera.offset_s == (905.0 if lost_at else 5.0)
     assert camera.armed == 7
+
+
+def test_attempt_that_finds_dead_led_counts_extra():
+    box, numbers = SimpleNamespace(failed_leds=set()), []
+    for number in count_attempts(box):
+        numbers.append(number)
+        if number in (1, 2, 4):
+            box.failed_leds.add(number)
+    assert numbers == [1, 2, 3, 4, 5, 6]

@@ -145,7 +145,7 @@ def test_hosts_and_boxes_of_both_revisions_work_together(flash_port, monkeypatch
     if older_box:
         drop_minor(monkeypatch)
     with FlashBox(flash_port()) as box:
-        assert protocol_minor(dict(box.limits)) == (0 if older_box else 2)
+        assert protocol_minor(dict(box.limits)) == (0 if older_box else 3)
         assert box.identity.version == 1
         box.arm()
         assert box.fire("a").count == 1
