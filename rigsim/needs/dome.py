@@ -9,7 +9,15 @@ from model import spectra
 from rigsim.arrays import FloatArray
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import max_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, decide_effect, omitted_effects
+from rigsim.needs.effects import (
+    Effect,
+    EffectSelection,
+    NeedsError,
+    PixelNoise,
+    decide_effect,
+    omitted_effects,
+)
+from rigsim.needs.sampled_light import SampledLight
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -22,6 +30,7 @@ def select_dome_effects(
     state: str,
     scenery: face.ViewingConditions,
     white_rgb: FloatArray | None,
+    light: SampledLight | None,
     movement: bool,
     motion: HeadMotion | None,
 ) -> EffectSelection:
@@ -38,6 +47,9 @@ def select_dome_effects(
     white_rgb
         Signal of a white plate at the origin in the plan's longest exposure from the brightest
         light, full scales, shape (3,); None: the brightest skin is at full scale.
+    light
+        Direct light of each lamp on a face, relative to that of the brightest on a plate at the
+        origin; None for a target.
     movement, motion
         Whether the face moves with its state, and the movement of the head.
     """
@@ -53,16 +65,19 @@ def select_dome_effects(
         ]
         made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject.name} is opaque"))
         return EffectSelection((*made, *omitted_effects("dome", "glare")))
+    if light is None:
+        raise NeedsError("light: got none, expected that on a face; sample it")
     skin = scenery.observe_skin(subject, state)
-    brightest = face.max_reflectance_rgb(skin)
     if white_rgb is None:
         white = spectra.camera_white(view.spectral_sensitivity, scenery.illuminant)
-        level = white * brightest / (white * brightest).max()
+        lit = face.LitFace.expose(skin, light, white, to_full_scale=True)
+        level = white * lit.brightest / (white * lit.brightest).max()
     else:
-        near = max(_max_brightness_gain(scenery.caster, light.position_mm) for light in rig.lights)
-        level = near * white_rgb * brightest
+        lit = face.LitFace.expose(skin, light, np.asarray(white_rgb, np.float64))
+        near = max(_max_brightness_gain(scenery.caster, one.position_mm) for one in rig.lights)
+        level = near * white_rgb * lit.brightest
     made += face.select_face_effects(
-        skin, scenery, brightest, level=level, peak=1.0, finer=False, lateral_switch="subsurface"
+        lit, scenery, level=level, finer=False, lateral_switch="subsurface"
     )
     made += _movement(subject, movement, motion, view)
     made += omitted_effects("dome", "dome_face")

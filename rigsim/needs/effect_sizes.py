@@ -91,13 +91,24 @@ def scattering_over_noise(lost: ArrayLike, level: ArrayLike, noise: PixelNoise) 
     return np.asarray(gained / noise.sigma(gained), np.float64)
 
 
-def max_exchange_fraction(caster: Caster) -> float:
-    """Bound the fraction of the light leaving a surface that falls back onto its hollows.
+def coarse_exchange(caster: Caster) -> Interreflection | None:
+    """Return the exchange of light between coarse patches of a surface; None: it is flat.
 
     Parameters
     ----------
     caster
         The mesh; its texture coordinates must not overlap.
+    """
+    return None if is_flat(caster.mesh) else Interreflection(caster, patches=EXCHANGE_PATCHES)
+
+
+def max_exchange_fraction(exchange: Interreflection | None) -> float:
+    """Bound the fraction of the light leaving a surface that falls back onto its hollows.
+
+    Parameters
+    ----------
+    exchange
+        Exchange between its patches, see `coarse_exchange`.
 
     Returns
     -------
@@ -105,11 +116,9 @@ def max_exchange_fraction(caster: Caster) -> float:
         The largest sum over patches of the exchange with one patch for a reflectance of 1, 0 to 1;
         0 for a flat or convex surface.
     """
-    if is_flat(caster.mesh):
+    if exchange is None:
         return 0.0
-
-    exchange = Interreflection(caster, patches=EXCHANGE_PATCHES).exchange
-    return float(np.asarray(exchange.sum(axis=1)).max(initial=0.0))
+    return float(np.asarray(exchange.exchange.sum(axis=1)).max(initial=0.0))
 
 
 def is_flat(mesh: Mesh) -> bool:

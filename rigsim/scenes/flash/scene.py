@@ -44,6 +44,7 @@ from rigsim.needs.effects import (
     merge_selections,
 )
 from rigsim.needs.flash import select_flash_effects
+from rigsim.needs.sampled_light import SampledLamp, SampledLight, sample_light
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
@@ -140,11 +141,24 @@ class FlashScene(FaceScene):
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
-        noise, share = PixelNoise.of(self._sensors[view.name]), self._stage.exchange_fraction
-        scenery = self._scenery(view, self._caster, share, noise, self._effects)
+        noise, exchange = PixelNoise.of(self._sensors[view.name]), self._stage.coarse_exchange
+        scenery = self._scenery(view, self._caster, exchange, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
-        seen = (scenery, white, self._flashes.weights, self.movement)
+        seen = (scenery, white, self._sampled_light(view), self.movement)
         return select_flash_effects(self.rig, self.subject, self.state, *seen)
+
+    def _sampled_light(self, view: View) -> SampledLight | None:
+        if not isinstance(self.subject, SimulatedSubject):
+            return None
+        key, known = (*self._flashes.key, view.position_mm), self._stage.sampled
+        if key not in known:
+            lamps = [
+                SampledLamp(light.position_mm, light.radius_mm, float(weight))
+                for light, weight in zip(self.rig.lights, self._flashes.weights, strict=True)
+            ]
+            cameras = np.array([view.position_mm])
+            known[key] = sample_light(self.subject, self._caster, [lamps], cameras)
+        return known[key]
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
@@ -330,8 +344,10 @@ class FlashScene(FaceScene):
 
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
-        glow = self._skin_glow(self._camera(view_name).spectral_sensitivity)
-        return edge_width_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
+        camera = self._camera(view_name).spectral_sensitivity
+        skin = ObservedSkin(self._face("skin"), self.state, camera, self._illuminant)
+        kernels = skin.lateral_kernels()
+        return edge_width_mm(kernels.sigmas_mm, kernels.weights)
 
     def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
         """Apply the analyzer to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
@@ -362,9 +378,7 @@ class FlashScene(FaceScene):
             return None
         step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
         if step is None:
-            step, _ = face_needs.choose_spectral_step(
-                skin, self.needs[face_needs.INTERREFLECTION_EFFECT]
-            )
+            step = int(self.needs[face_needs.WAVELENGTH_STEP_EFFECT].choice or 1)
         return InterreflectionSettings(
             self._stage.exchange, spectral, step, self._last_bounce(self._effects)
         )

@@ -7,7 +7,8 @@ from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.light.subsurface_radiance import SurfaceIllumination
 from rigsim.mitsuba.variant import VariantChoice
-from rigsim.needs.effect_sizes import max_exchange_fraction
+from rigsim.needs.effect_sizes import coarse_exchange
+from rigsim.needs.sampled_light import SampledLight
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
@@ -27,11 +28,12 @@ class FlashGeometry:
     def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
         self.held, self.caster = held, caster
         self.light: dict[object, SurfaceIllumination] = {}  # on the face, by its source
+        self.sampled: dict[object, SampledLight] = {}  # the same for rules, by source and camera
 
     @cached_property
-    def exchange_fraction(self) -> float:
-        """`max_exchange_fraction` of the mesh."""
-        return max_exchange_fraction(self.caster)
+    def coarse_exchange(self) -> Interreflection | None:
+        """`rigsim.needs.effect_sizes.coarse_exchange` of the mesh."""
+        return coarse_exchange(self.caster)
 
     @cached_property
     def exchange(self) -> Interreflection:
