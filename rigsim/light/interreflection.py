@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, dilate_texture, sample, unwrap
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.surface_brdf import transmittance
@@ -318,41 +318,3 @@ class InterreflectionColor:
         u, v = np.meshgrid(middle, middle[::-1])
         uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
         return sample(filled, uv, np.ones((size, size), np.bool_))
-
-
-def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
-    """Return the excess of each channel's mean of R^2 over the square of its mean, shape (3,).
-
-    It is evaluated for typical skin.
-    """
-    weights = skin.band_weights()
-    typical = skin.table.spectra(*(np.median(part) for part in skin.covered_chromophores()))
-    return np.asarray(np.abs((typical**2 @ weights) / (typical @ weights) ** 2 - 1.0), np.float64)
-
-
-def wavelength_step_error(skin: ObservedSkin, step: int) -> Float64Array:
-    """Return each channel's relative error of interreflection at fewer wavelengths.
-
-    Parameters
-    ----------
-    skin
-        The face.
-    step
-        Step through the table's wavelengths.
-
-    Returns
-    -------
-    ndarray
-        Relative, shape (3,): the maximum for light between any two of the face's extremes and
-        centers of melanin and blood, as the mean of products over the mean.
-    """
-    ends = [[part.min(), np.median(part), part.max()] for part in skin.covered_chromophores()]
-    melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
-    spectra = skin.table.spectra(melanin, blood)
-
-    def bounced(every: int) -> Float64Array:
-        some, weights = spectra[:, ::every], skin.band_weights(every)
-        twice = np.einsum("al,bl,lc->abc", some, some, weights)
-        return np.asarray(twice / (some @ weights)[None], np.float64)
-
-    return np.asarray(np.abs(bounced(step) / bounced(1) - 1.0).max(axis=(0, 1)), np.float64)

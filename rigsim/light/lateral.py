@@ -72,6 +72,10 @@ def scatter_laterally(
     """
     if field.ndim != 3 or field.shape[:2] != atlas.prim.shape:
         raise LateralError(f"field: got shape {field.shape}, expected (N, N, C) of the atlas")
+    if np.ndim(weights) != 2 or len(np.asarray(weights)) != field.shape[2]:
+        raise LateralError(
+            f"weights: got shape {np.shape(weights)}, expected (C, K), C = {field.shape[2]}"
+        )
     return HeatFlow(atlas, sigmas_mm, weights).scatter(field)
 
 

@@ -25,6 +25,7 @@ from rigsim.needs.effects import (
 from rigsim.needs.sampled_light import (
     BOUNCE_CANDIDATES,
     EXACT_BOUNCE_FRACTION,
+    TEXEL_STEP,
     SampledBounces,
     SampledLight,
     blur_over_noise,
@@ -49,9 +50,6 @@ RELIEF_EFFECT = "relief of the skin"
 PIGMENT_EFFECT = "pattern of pigment"
 RELIEF_SHADOW_EFFECT = "shadows of relief"
 
-TEXEL_STEP = 16
-"""Every n-th texel's reflectance is evaluated."""
-
 RULE_DIRECTIONS = 12
 """Number of directions with horizons of the relief, for the size of its shadows."""
 
@@ -63,11 +61,11 @@ is at most a few thousand times the noise, of which a tenth counts."""
 MAX_REMAINING_NOISE_RATIO = 0.05
 """Limit of the remaining bounces, relative to the noise."""
 
-BOUNCE_MARGIN = 1.0
-LATERAL_MARGIN = 1.0
-LENS_MARGIN = 1.0
-RELIEF_MARGIN = 1.0
-"""Factors of safety on the sizes of sampled light, set on 20 scenes per rig."""
+BOUNCE_MARGIN = 2.0
+STEP_MARGIN = 4.0
+LATERAL_MARGIN = 0.6
+LENS_MARGIN = 0.6
+"""Factors on the sizes of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -279,9 +277,16 @@ def relief_shadow_effect(face: LitFace, scenery: ViewingConditions) -> Effect:
         np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
     )
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
-    unit = face.white * face.brightest
-    size = RELIEF_MARGIN * relief_shadows_over_noise(
-        subject, ReliefShadow(subject, RULE_DIRECTIONS), face.light, unit, scenery.noise
+    pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
+    size = relief_shadows_over_noise(
+        subject,
+        scenery.caster,
+        ReliefShadow(subject, RULE_DIRECTIONS),
+        face.light,
+        face.reflectance,
+        face.white,
+        scenery.noise,
+        pixel_mm,
     )
     return decide_effect(
         RELIEF_SHADOW_EFFECT,
@@ -416,7 +421,7 @@ def _wavelength_step_effect(found: SampledBounces, exact: Float64Array, spectral
         )
     change, chosen = math.inf, 1
     for step in WAVELENGTH_STEPS:
-        change = BOUNCE_MARGIN * found.over_noise(exact, found.arriving(spectral=True, step=step))
+        change = STEP_MARGIN * found.over_noise(exact, found.arriving(spectral=True, step=step))
         if change < NEGLIGIBLE_NOISE_RATIO:
             chosen = step
             break

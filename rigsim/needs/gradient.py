@@ -30,7 +30,7 @@ MAX_SLOPE_GAIN: Final = 1.6
 """Largest steepening of the relief by compression: the skin buckles at 0.66 of its length."""
 
 PATCH_MARGINS: Final = {"shadows": 3.0, "lateral": 1.8, "interreflections": 1.5, "optics": 3.0}
-"""Factors of safety on the sizes in a window, set on 20 scenes."""
+"""Factors on the sizes in a window, set on 10 scenes."""
 
 PIGMENT_RANGE: Final = (0.25, 1.0, 4.0)
 BLOOD_RANGE: Final = (0.7, 1.0, 3.0)
