@@ -29,7 +29,7 @@ OPTICS_EFFECT: Final = "diffraction and defocus"
 MAX_SLOPE_GAIN: Final = 1.6
 """Largest steepening of the relief by compression: the skin buckles at 0.66 of its length."""
 
-PATCH_MARGINS: Final = {"shadows": 3.0, "lateral": 1.8, "interreflections": 1.5, "optics": 3.0}
+PATCH_MARGINS: Final = {"shadows": 3.0, "lateral": 1.8, "interreflections": 1.7, "optics": 3.0}
 """Factors on the sizes in a window, set on 10 scenes."""
 
 PIGMENT_RANGE: Final = (0.25, 1.0, 4.0)

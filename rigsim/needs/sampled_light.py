@@ -43,7 +43,7 @@ RELIEF_PIXELS: Final = 500
 """Number of pixels whose relief shadows are evaluated."""
 
 HORIZON_MARGIN: Final = 0.5
-GRAZING_MARGIN: Final = 1.3
+GRAZING_MARGIN: Final = 2.6
 """Factors on shadows of high horizons and of grazing light, set on the same scenes as the margins
 of `rigsim.needs.face`."""
 
