@@ -7,6 +7,7 @@ import numpy as np
 from capture.rig import Rig, Vector, View
 from model import spectra
 from rigsim.arrays import FloatArray
+from rigsim.light.led_light import white_intensity
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import max_irradiance
 from rigsim.needs.effects import (
@@ -17,7 +18,7 @@ from rigsim.needs.effects import (
     decide_effect,
     omitted_effects,
 )
-from rigsim.needs.sampled_light import SampledLight
+from rigsim.needs.sampled_light import LitFace, SampledLamp, SampledLight, sample_light
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -70,10 +71,10 @@ def select_dome_effects(
     skin = scenery.observe_skin(subject, state)
     if white_rgb is None:
         white = spectra.camera_white(view.spectral_sensitivity, scenery.illuminant)
-        lit = face.LitFace.expose(skin, light, white, to_full_scale=True)
+        lit = LitFace.expose(skin, light, white, to_full_scale=True)
         level = white * lit.brightest / (white * lit.brightest).max()
     else:
-        lit = face.LitFace.expose(skin, light, np.asarray(white_rgb, np.float64))
+        lit = LitFace.expose(skin, light, np.asarray(white_rgb, np.float64))
         near = max(_max_brightness_gain(scenery.caster, one.position_mm) for one in rig.lights)
         level = near * white_rgb * lit.brightest
     made += face.select_face_effects(
@@ -87,6 +88,27 @@ def select_dome_effects(
     if face.LATERAL_EFFECT in built:
         made += omitted_effects("dome_lateral")
     return EffectSelection(tuple(made))
+
+
+def sample_led_light(
+    rig: Rig, subject: SimulatedSubject | Target, caster: Caster
+) -> SampledLight | None:
+    """Return the light of each LED on a face, over that of the brightest on a plate at the origin.
+
+    None for a target.
+    """
+    if not isinstance(subject, SimulatedSubject):
+        return None
+    view = rig.views[0]
+    strength = np.array([float(white_intensity(light, view).max()) for light in rig.lights])
+    squared = np.array([float(np.square(light.position_mm).sum()) for light in rig.lights])
+    weights = strength / (strength / squared).max()
+    lamps = [
+        [SampledLamp(light.position_mm, light.radius_mm, float(weight))]
+        for light, weight in zip(rig.lights, weights, strict=True)
+    ]
+    cameras = np.array([view.position_mm for view in rig.views])
+    return sample_light(subject, caster, lamps, cameras)
 
 
 def _movement(

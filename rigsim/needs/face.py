@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from capture.rig import Rig, View
-from rigsim.arrays import Float32Array, Float64Array, FloatArray
+from rigsim.arrays import Float64Array, FloatArray
 from rigsim.light.interreflection import WAVELENGTH_STEPS, Interreflection
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.relief_shadow import ReliefShadow
@@ -25,13 +24,12 @@ from rigsim.needs.effects import (
 from rigsim.needs.sampled_light import (
     BOUNCE_CANDIDATES,
     EXACT_BOUNCE_FRACTION,
-    TEXEL_STEP,
+    LitFace,
     SampledBounces,
-    SampledLight,
     blur_over_noise,
-    relief_shadows_over_noise,
     scattering_over_noise,
 )
+from rigsim.needs.sampled_relief import relief_shadows_over_noise
 from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render import Caster
 from rigsim.render.depth_of_field import depth_before_focus, depth_range, tabulate_defocus
@@ -89,68 +87,6 @@ class ViewingConditions:
     def observe_skin(self, subject: SimulatedSubject, state: str) -> ObservedSkin:
         """Return a face under this camera and light."""
         return ObservedSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LitFace:
-    """A face under a camera in K images."""
-
-    skin: ObservedSkin
-    """The face."""
-    reflectance: Float32Array
-    """Its reflectance, shape (N, N, 3)."""
-    light: SampledLight
-    """Direct light on it."""
-    white: Float64Array
-    """Signal of a white plate under an irradiance of 1, full scales, shape (K, 3)."""
-
-    @classmethod
-    def expose(
-        cls,
-        skin: ObservedSkin,
-        light: SampledLight,
-        white: Float64Array,
-        *,
-        to_full_scale: bool = False,
-    ) -> LitFace:
-        """Return a face under light.
-
-        Parameters
-        ----------
-        skin, light
-            The face and the light.
-        white
-            Signal of a white plate under an irradiance of 1, shape (3,).
-        to_full_scale
-            Whether the brightest texel of each image is at full scale instead.
-        """
-        unit = np.broadcast_to(white, (len(light.images), 3)).astype(np.float64)
-        lit = cls(skin, skin.reflectance(), light, unit)
-        if not to_full_scale:
-            return lit
-        peaks = [float(np.max(lit.diffuse(k) + lit.highlight(k))) for k in range(len(unit))]
-        return dataclasses.replace(lit, white=unit / np.maximum(peaks, 1e-12)[:, None])
-
-    def diffuse(self, image: int) -> Float64Array:
-        """Return the texels' direct light from inside, full scales, shape (n, n, 3)."""
-        light = self.light.irradiance[image][..., None] * self.reflectance[self.light.part]
-        return np.asarray(self.white[image] * light, np.float64)
-
-    def highlight(self, image: int) -> Float64Array:
-        """Return the texels' surface reflection, full scales, shape (n, n, 3)."""
-        return np.asarray(self.white[image] * self.light.highlight[image][..., None], np.float64)
-
-    @property
-    def peak(self) -> float:
-        """Signal of the brightest texel, full scales."""
-        images = range(len(self.white))
-        return max(float((self.diffuse(k) + self.highlight(k)).max()) for k in images)
-
-    @property
-    def brightest(self) -> Float64Array:
-        """Largest reflectance in each channel, shape (3,)."""
-        covered = self.skin.subject.atlas.covered
-        return np.asarray(self.reflectance[covered][::TEXEL_STEP].max(axis=0), np.float64)
 
 
 def select_face_effects(

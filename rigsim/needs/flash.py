@@ -7,7 +7,7 @@ from rigsim.arrays import FloatArray
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import max_irradiance
 from rigsim.needs.effects import Effect, EffectSelection, NeedsError, decide_effect, omitted_effects
-from rigsim.needs.sampled_light import SampledLight
+from rigsim.needs.sampled_light import LitFace, SampledLight
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
@@ -54,7 +54,7 @@ def select_flash_effects(
         raise NeedsError("light: got none, expected that on a face; sample it")
     skin = scenery.observe_skin(subject, state)
     white = np.asarray(white_rgb, np.float64)
-    lit = face.LitFace.expose(skin, light, white)
+    lit = LitFace.expose(skin, light, white)
     places = np.array([lamp.position_mm for lamp in light.images[0]])
     weights = [lamp.weight_mm2 for lamp in light.images[0]]
     # not clipped at full scale: the light of saturated pixels reaches others unclipped

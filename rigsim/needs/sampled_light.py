@@ -6,7 +6,7 @@ computed between coarse patches. Both cost a small part of one image.
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +23,6 @@ from rigsim.light.interreflection import (
     coarse_skin,
 )
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.relief_shadow import HORIZON_SOFTNESS_RAD, ReliefShadow
 from rigsim.light.subsurface_radiance import inner_albedo
 from rigsim.needs.effects import PixelNoise
 from rigsim.render import Caster, visibility
@@ -39,19 +38,8 @@ SHADOW_SAMPLES: Final = 2
 MIN_VIEW_COSINE: Final = 0.02
 """Cosine between normal and camera below which a texel is not visible."""
 
-RELIEF_PIXELS: Final = 500
-"""Number of pixels whose relief shadows are evaluated."""
-
-HORIZON_MARGIN: Final = 0.5
-GRAZING_MARGIN: Final = 2.6
-"""Factors on shadows of high horizons and of grazing light, set on the same scenes as the margins
-of `rigsim.needs.face`."""
-
 TEXEL_STEP: Final = 16
 """Every n-th texel's reflectance is evaluated for the largest."""
-
-MAX_PIXEL_TEXELS: Final = 6
-"""Texels along each side of such a pixel."""
 
 OUTLINE_COSINE: Final = 0.5
 """Cosine between normal and camera below which a texel counts as near the face's outline."""
@@ -372,82 +360,63 @@ def _step_over_noise(
     return float(change.max(initial=0.0))
 
 
-def relief_shadows_over_noise(
-    subject: SimulatedSubject,
-    caster: Caster,
-    relief: ReliefShadow,
-    light: SampledLight,
-    reflectance: Float32Array,
-    white: Float64Array,
-    noise: PixelNoise,
-    pixel_mm: float,
-) -> float:
-    """Return the largest change of a pixel by shadows of a face's relief, over its noise.
+@dataclass(frozen=True, slots=True, eq=False)
+class LitFace:
+    """A face under a camera in K images."""
 
-    Parameters
-    ----------
-    subject, caster
-        The face in its pose, and its mesh.
-    relief
-        Its horizons.
-    light
-        The lamps.
-    reflectance
-        The face's reflectance, shape (N, N, 3).
-    white
-        Signal of a white plate under an irradiance of 1, full scales, shape (K, 3).
-    noise
-        Noise of the sensor.
-    pixel_mm
-        Side of a pixel on the subject, mm.
+    skin: ObservedSkin
+    """The face."""
+    reflectance: Float32Array
+    """Its reflectance, shape (N, N, 3)."""
+    light: SampledLight
+    """Direct light on it."""
+    white: Float64Array
+    """Signal of a white plate under an irradiance of 1, full scales, shape (K, 3)."""
 
-    Notes
-    -----
-    Pixels around the visible texels with the highest horizons are evaluated. Elsewhere the shadows
-    are soft where light grazes: an elevation e below the half width s of a shadow's edge loses
-    sin e (1/2 - e / (2 s)), at most s / 8.
-    """
-    atlas = subject.atlas
-    step = light.part[0].step
-    coarse = np.minimum(np.arange(atlas.size) // step, len(light.visible) - 1)
-    is_visible = atlas.covered & light.visible[np.ix_(coarse, coarse)]
-    row, column = relief.highest_horizons(is_visible, RELIEF_PIXELS)
-    if not len(row):
-        return 0.0
-    side = max(1, min(round(pixel_mm / atlas.typical_texel_mm()), MAX_PIXEL_TEXELS))
-    around = np.arange(side) - side // 2
-    row = row[:, None, None] + around[:, None] + np.zeros_like(around)
-    column = column[:, None, None] + np.zeros_like(around)[:, None] + around
-    row, column = (np.clip(part, 0, atlas.size - 1).reshape(-1) for part in (row, column))
-    position, normal = atlas.position_mm[row, column], atlas.normal[row, column]
-    uv = np.stack([(column + 0.5) / atlas.size, 1.0 - (row + 0.5) / atlas.size], axis=-1)
-    most = 0.0
-    albedo = reflectance[row, column]
-    largest = reflectance[is_visible][::TEXEL_STEP].max(axis=0)
-    for lamps, one in zip(light.images, white, strict=True):
-        full, left, grazing = (np.zeros(len(part)) for part in (row, row, lamps))
-        for k, lamp in enumerate(lamps):
-            disc = {"radius_mm": lamp.radius_mm}
-            way = np.asarray(lamp.position_mm) - position
-            squared = np.einsum("ij,ij->i", way, way)
-            cosine = np.einsum("ij,ij->i", way, normal) / np.sqrt(squared)
-            seen = visibility(
-                caster, position, normal, lamp.position_mm, samples=SHADOW_SAMPLES, **disc
-            )
-            came = lamp.weight_mm2 / squared * np.maximum(cosine, 0.0) * seen
-            full += came
-            left += came * relief.visible_fraction(
-                uv.astype(np.float32), position, lamp.position_mm, **disc
-            )
-            nearest = float(squared.min())
-            soft = max(lamp.radius_mm / math.sqrt(nearest), HORIZON_SOFTNESS_RAD)
-            grazing[k] = lamp.weight_mm2 / nearest * soft / 8.0
-        lost, rest = (
-            one * (part[:, None] * albedo).reshape(-1, side**2, 3).mean(axis=1)
-            for part in (full - left, left)
-        )
-        change = np.minimum(lost, 1.0) / noise.sigma(rest)
-        faint = np.minimum(float(grazing.max()) * one * largest, 1.0)
-        dim = float((faint / noise.sigma(faint)).max())
-        most = max(most, HORIZON_MARGIN * float(change.max()), GRAZING_MARGIN * dim)
-    return most
+    @classmethod
+    def expose(
+        cls,
+        skin: ObservedSkin,
+        light: SampledLight,
+        white: Float64Array,
+        *,
+        to_full_scale: bool = False,
+    ) -> LitFace:
+        """Return a face under light.
+
+        Parameters
+        ----------
+        skin, light
+            The face and the light.
+        white
+            Signal of a white plate under an irradiance of 1, shape (3,).
+        to_full_scale
+            Whether the brightest texel of each image is at full scale instead.
+        """
+        unit = np.broadcast_to(white, (len(light.images), 3)).astype(np.float64)
+        lit = cls(skin, skin.reflectance(), light, unit)
+        if not to_full_scale:
+            return lit
+        peaks = [float(np.max(lit.diffuse(k) + lit.highlight(k))) for k in range(len(unit))]
+        return dataclasses.replace(lit, white=unit / np.maximum(peaks, 1e-12)[:, None])
+
+    def diffuse(self, image: int) -> Float64Array:
+        """Return the texels' direct light from inside, full scales, shape (n, n, 3)."""
+        light = self.light.irradiance[image][..., None] * self.reflectance[self.light.part]
+        return np.asarray(self.white[image] * light, np.float64)
+
+    def highlight(self, image: int) -> Float64Array:
+        """Return the texels' surface reflection, full scales, shape (n, n, 3)."""
+        return np.asarray(self.white[image] * self.light.highlight[image][..., None], np.float64)
+
+    @property
+    def peak(self) -> float:
+        """Signal of the brightest texel, full scales."""
+        images = range(len(self.white))
+        return max(float((self.diffuse(k) + self.highlight(k)).max()) for k in images)
+
+    @property
+    def brightest(self) -> Float64Array:
+        """Largest reflectance in each channel, shape (3,)."""
+        covered = self.skin.subject.atlas.covered
+        return np.asarray(self.reflectance[covered][::TEXEL_STEP].max(axis=0), np.float64)

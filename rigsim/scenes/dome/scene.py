@@ -43,10 +43,9 @@ from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.mitsuba.image_hits import AddedLight
 from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
-from rigsim.needs.dome import min_noise, select_dome_effects
+from rigsim.needs.dome import min_noise, sample_led_light, select_dome_effects
 from rigsim.needs.effect_sizes import coarse_exchange
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
-from rigsim.needs.sampled_light import SampledLamp, SampledLight, sample_light
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
@@ -138,7 +137,8 @@ class DomeScene(FaceScene):
         exchange = coarse_exchange(self._caster)
         scenery = self._scenery(rig.views[0], self._caster, exchange, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
-        seen = (scenery, white, self._sampled_light(), movement, motion)
+        light = sample_led_light(rig, self.subject, self._caster)
+        seen = (scenery, white, light, movement, motion)
         self.needs = select_dome_effects(rig, self.subject, state, *seen)
         self.subject = select_face_tissue(self.subject, self.needs)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
@@ -191,21 +191,6 @@ class DomeScene(FaceScene):
         if led.name in self.dome.dead:
             return np.zeros(3, np.float32)
         return white_intensity(led, self._camera(view_name)).astype(np.float32)
-
-    def _sampled_light(self) -> SampledLight | None:
-        """Return the light of each LED, over that of the brightest on a plate at the origin."""
-        if not isinstance(self.subject, SimulatedSubject):
-            return None
-        lights, view = self.rig.lights, self.rig.views[0]
-        strength = np.array([float(white_intensity(light, view).max()) for light in lights])
-        squared = np.array([float(np.square(light.position_mm).sum()) for light in lights])
-        weights = strength / (strength / squared).max()
-        lamps = [
-            [SampledLamp(light.position_mm, light.radius_mm, float(weight))]
-            for light, weight in zip(lights, weights, strict=True)
-        ]
-        cameras = np.array([view.position_mm for view in self.rig.views])
-        return sample_light(self.subject, self._caster, lamps, cameras)
 
     def _white_level_at_origin(self) -> Float64Array:
         """Return the full scales per second of a white plate that faces the brightest light."""

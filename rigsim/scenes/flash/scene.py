@@ -11,7 +11,7 @@ parallel as behind crossed polarizers, for every subject.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,6 @@ from rigsim.needs.effects import (
     merge_selections,
 )
 from rigsim.needs.flash import select_flash_effects
-from rigsim.needs.sampled_light import SampledLamp, SampledLight, sample_light
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
@@ -73,6 +72,9 @@ FLAT_FIELD_LEVEL: Final = 0.9
 
 POP_ENERGY_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy between pops."""
+
+
+FlashTruth: TypeAlias = dict[str, NDArray[np.generic]]
 
 
 class FlashScene(FaceScene):
@@ -144,21 +146,13 @@ class FlashScene(FaceScene):
         noise, exchange = PixelNoise.of(self._sensors[view.name]), self._stage.coarse_exchange
         scenery = self._scenery(view, self._caster, exchange, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
-        seen = (scenery, white, self._sampled_light(view), self.movement)
+        seen = (
+            scenery,
+            white,
+            self._stage.sample_light(self.subject, self._flashes, view),
+            self.movement,
+        )
         return select_flash_effects(self.rig, self.subject, self.state, *seen)
-
-    def _sampled_light(self, view: View) -> SampledLight | None:
-        if not isinstance(self.subject, SimulatedSubject):
-            return None
-        key, known = (*self._flashes.key, view.position_mm), self._stage.sampled
-        if key not in known:
-            lamps = [
-                SampledLamp(light.position_mm, light.radius_mm, float(weight))
-                for light, weight in zip(self.rig.lights, self._flashes.weights, strict=True)
-            ]
-            cameras = np.array([view.position_mm])
-            known[key] = sample_light(self.subject, self._caster, [lamps], cameras)
-        return known[key]
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
@@ -346,8 +340,7 @@ class FlashScene(FaceScene):
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
         camera = self._camera(view_name).spectral_sensitivity
         skin = ObservedSkin(self._face("skin"), self.state, camera, self._illuminant)
-        kernels = skin.lateral_kernels()
-        return edge_width_mm(kernels.sigmas_mm, kernels.weights)
+        return edge_width_mm((kernels := skin.lateral_kernels()).sigmas_mm, kernels.weights)
 
     def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
         """Apply the analyzer to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
@@ -376,9 +369,9 @@ class FlashScene(FaceScene):
     def _bounces(self, skin: ObservedSkin) -> InterreflectionSettings | None:
         if not self.interreflections:
             return None
-        step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
-        if step is None:
-            step = int(self.needs[face_needs.WAVELENGTH_STEP_EFFECT].choice or 1)
+        spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
+        chosen = int(self.needs[face_needs.WAVELENGTH_STEP_EFFECT].choice or 1)
+        step = self._effects.spectral_step or chosen
         return InterreflectionSettings(
             self._stage.exchange, spectral, step, self._last_bounce(self._effects)
         )
@@ -413,13 +406,9 @@ class FlashScene(FaceScene):
         glow = self._skin_glow(view.spectral_sensitivity)
         return look.blurred_maps(self._face(), self.state, glow)
 
-    def _fractions_at_rest(
-        self, view: View, moved: dict[str, NDArray[np.generic]]
-    ) -> dict[str, NDArray[np.generic]]:
+    def _fractions_at_rest(self, view: View, moved: FlashTruth) -> FlashTruth:
         """Return the fractions of this state mapped onto the face at rest."""
-        face = self._face()
-        rest = face.rest
-        if rest is None:
+        if (rest := (face := self._face()).rest) is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
         spread = self._blurred_textures(view) if self.lateral else None
         look = self._flash_camera(view, rest.mesh)
@@ -430,10 +419,8 @@ class FlashScene(FaceScene):
     def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
-            depths = depth_range(view, mesh)
-            spread = tabulate_defocus(
-                view, self._illuminant, subpixels=self.subpixels, depths_mm=depths
-            )
+            how = {"subpixels": self.subpixels, "depths_mm": depth_range(view, mesh)}
+            spread = tabulate_defocus(view, self._illuminant, **how)
         return FlashCamera(self.rig, view, self.subpixels, spread)
 
     @cached_method

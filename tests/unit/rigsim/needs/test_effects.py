@@ -218,7 +218,7 @@ def test_sampled_highlights_reach_those_of_image(flash, faces):
     for rig in (flash, grazing(flash, 60.0)):
         scene = FlashScene(rig, faces["black"], effects=SceneEffects(lateral=False, optics=False))
         shown = scene.radiance("parallel") - scene.radiance("crossed")
-        light = scene._sampled_light(rig.views[0])
+        light = scene._stage.sample_light(scene.subject, scene._flashes, rig.views[0])
         peak = float((light.highlight.max() * scene.white_rgb()).max())
         assert shown.max() < 1.2 * peak < 6.0 * shown.max()
 
