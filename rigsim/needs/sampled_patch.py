@@ -37,7 +37,7 @@ HORIZON_SECTORS: Final = 8
 SLOPE_GAIN: Final = 1.5
 """Steepening of the relief by compression to 0.7 of its length, as in the usual plan."""
 
-EXTINCTION: Final = 1e3
+POLARIZER_EXTINCTION: Final = 1e3
 """Extinction ratio of polarizers; the actual one hardly changes the sizes."""
 
 LIT_PATTERNS: Final = tuple(w for name, w in PATTERN_WEIGHTS.items() if name != "dark")
@@ -106,7 +106,8 @@ class SampledPatch:
     def normals(self) -> Float32Array:
         """Unit normals, shape (m, m, 3)."""
         height = self._height_um(1)
-        down, right = (part[1:-1, 1:-1] for part in np.gradient(height, self.patch.texel_um))
+        slopes = np.gradient(height, self.patch.texel_um)
+        down, right = (np.asarray(part)[1:-1, 1:-1] for part in slopes)
         length = np.sqrt(1.0 + right**2 + down**2)
         return np.stack([-right / length, down / length, 1.0 / length], -1).astype(np.float32)
 
@@ -123,7 +124,9 @@ class SampledPatch:
     @cached_property
     def _surface(self) -> MicrofacetSurface:
         alpha = float(np.median(self.alpha))
-        return MicrofacetSurface(alpha, ETA, self.view.position_mm, self.view.axes[0], EXTINCTION)
+        return MicrofacetSurface(
+            alpha, ETA, self.view.position_mm, self.view.axes[0], POLARIZER_EXTINCTION
+        )
 
     @cached_property
     def _white(self) -> float:

@@ -79,17 +79,17 @@ def relief_shadows_over_noise(
     for lamps, one in zip(light.images, white, strict=True):
         full, left, grazing = (np.zeros(len(part)) for part in (row, row, lamps))
         for k, lamp in enumerate(lamps):
-            disc = {"radius_mm": lamp.radius_mm}
+            radius = lamp.radius_mm
             way = np.asarray(lamp.position_mm) - position
             squared = np.einsum("ij,ij->i", way, way)
             cosine = np.einsum("ij,ij->i", way, normal) / np.sqrt(squared)
             seen = visibility(
-                caster, position, normal, lamp.position_mm, samples=SHADOW_SAMPLES, **disc
+                caster, position, normal, lamp.position_mm, radius_mm=radius, samples=SHADOW_SAMPLES
             )
             came = lamp.weight_mm2 / squared * np.maximum(cosine, 0.0) * seen
             full += came
             left += came * relief.visible_fraction(
-                uv.astype(np.float32), position, lamp.position_mm, **disc
+                uv.astype(np.float32), position, lamp.position_mm, radius_mm=radius
             )
             nearest = float(squared.min())
             soft = max(lamp.radius_mm / math.sqrt(nearest), HORIZON_SOFTNESS_RAD)
