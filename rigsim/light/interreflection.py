@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, dilate_texture, sample, unwrap
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.surface_brdf import transmittance
@@ -40,6 +40,10 @@ MAX_BOUNCES: Final = 30
 PATCHES_PER_SIDE: Final = 96
 """Texels along each side of the coarse texture. On a pale head under one light, interreflection is
 1 % of all light; against Mitsuba it is 16 % low with 64, 6 % with 96 and 4 % with 128."""
+
+MIN_TRANSFER: Final = 1e-6
+"""Exchange of two patches below which it is omitted: a fifth of all pairs of a face, which carry
+0.1 % of the exchanged light."""
 
 PAIRS_PER_BLOCK: Final = 1 << 21
 
@@ -71,6 +75,13 @@ class Interreflection:
         """Average a texture over the patches, shape (P, C), from shape (N, N, C)."""
         size, coarse = texture.shape[0], self.atlas.size
         row = np.arange(size) * coarse // size
+        if size >= coarse:
+            first = np.searchsorted(row, np.arange(coarse))
+            count = np.diff(np.append(first, size)).astype(np.float64)
+            sums = np.add.reduceat(texture, first, axis=0, dtype=np.float64)
+            sums = np.add.reduceat(sums, first, axis=1)
+            mean = sums / (count[:, None] * count)[..., None]
+            return np.asarray(mean[self._covered], np.float32)
         sums = np.zeros((coarse, coarse, texture.shape[2]), np.float64)
         count = np.zeros((coarse, coarse), np.float64)
         np.add.at(sums, (row[:, None], row[None, :]), texture)
@@ -146,7 +157,7 @@ def _exchange(
     for first in range(0, count, step):
         block = np.arange(first, min(first + step, count))
         strength = np.zeros((len(block), count - first), np.float32)
-        _pair_transfer(point, normal, first, strength)
+        _pair_transfer(point, normal, area, first, math.pi * MIN_TRANSFER, strength)
         i, j = np.nonzero(strength)
         start = point[block[i]] + np.float32(RAY_OFFSET_MM) * normal[block[i]]
         way = point[first + j] + np.float32(RAY_OFFSET_MM) * normal[first + j] - start
@@ -168,8 +179,11 @@ def _exchange(
 
 
 @njit(parallel=True, cache=True)
-def _pair_transfer(point, normal, first, out):  # type: ignore[no-untyped-def]
-    """Write cos cos T T / d^2 for mutually facing pairs, one direction of each pair."""
+def _pair_transfer(point, normal, area, first, least, out):  # type: ignore[no-untyped-def]
+    """Write cos cos T T / d^2 for mutually facing pairs, one direction of each pair.
+
+    Pairs that exchange less than ``least``, over pi, are omitted.
+    """
     for n in prange(out.shape[0]):
         i = first + n
         for j in range(i + 1, first + out.shape[1]):
@@ -183,6 +197,9 @@ def _pair_transfer(point, normal, first, out):  # type: ignore[no-untyped-def]
             squared = x * x + y * y + z * z
             length = math.sqrt(squared)
             here, there = min(here / length, 1.0), min(there / length, 1.0)
+            largest = max(area[i], area[j]) / squared * here * there
+            if largest < least:  # the boundary transmits less than all
+                continue
             out[n, j - first] = here * there * transmittance(here) * transmittance(there) / squared
 
 
@@ -207,6 +224,23 @@ class InterreflectionSettings:
     """Fraction of the first bounce below which further bounces are omitted."""
 
 
+def coarse_skin(
+    exchange: Interreflection, skin: ObservedSkin, r_d: Float32Array, reflectance: Float32Array
+) -> Float32Array:
+    """Return a face's skin on patches, arguments as for `InterreflectionColor`.
+
+    Shape (P, 10): coverage, melanin, blood, thickness, covering over reflectance (3), and r_d (3).
+    """
+    subject = skin.subject
+    covered = subject.atlas.covered.astype(np.float32)
+    factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
+    fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
+    layers = np.dstack([covered, *fractions, factor, r_d])
+    coarse = exchange.coarsen(np.asarray(layers * covered[..., None], np.float32))
+    coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
+    return coarse
+
+
 class InterreflectionColor:
     """Interreflection on one face in one state, in one camera's channels.
 
@@ -220,6 +254,8 @@ class InterreflectionColor:
         Factor of the diffuse term per channel, including the skin's covering, shape (N, N, 3).
     reflectance
         White-balanced reflectance of the skin per channel, shape (N, N, 3).
+    coarse
+        Result of `coarse_skin`; None computes it.
     """
 
     def __init__(
@@ -228,21 +264,18 @@ class InterreflectionColor:
         skin: ObservedSkin,
         r_d: Float32Array,
         reflectance: Float32Array,
+        coarse: Float32Array | None = None,
     ) -> None:
         self._bounce, self._min_bounce_fraction = bounces.exchange, bounces.min_bounce_fraction
-        subject = skin.subject
-        covered = subject.atlas.covered.astype(np.float32)
-        factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-        fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
-        layers = np.dstack([covered, *fractions, factor, r_d])
-        coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
-        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
+        if coarse is None:
+            coarse = coarse_skin(self._bounce, skin, r_d, reflectance)
         self._r_d = np.ascontiguousarray(coarse[:, 7:])
         self._weights: Float32Array | None = None
         if bounces.spectral:
             weights = skin.band_weights(bounces.step)
             # patches off the skin have a thickness of 0
-            thickness = np.clip(coarse[:, 3], fractions[2].min(), fractions[2].max())
+            ratio = skin.subject.thickness_ratio
+            thickness = np.clip(coarse[:, 3], ratio.min(), ratio.max())
             spectra = skin.spectra(coarse[:, 1], coarse[:, 2], thickness)[:, :: bounces.step]
             cover = coarse[:, 4:7].mean(axis=1, keepdims=True)
             self._spectrum = np.asarray(spectra * cover, np.float32)
@@ -285,41 +318,3 @@ class InterreflectionColor:
         u, v = np.meshgrid(middle, middle[::-1])
         uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
         return sample(filled, uv, np.ones((size, size), np.bool_))
-
-
-def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
-    """Return the excess of each channel's mean of R^2 over the square of its mean, shape (3,).
-
-    It is evaluated for typical skin.
-    """
-    weights = skin.band_weights()
-    typical = skin.table.spectra(*(np.median(part) for part in skin.covered_chromophores()))
-    return np.asarray(np.abs((typical**2 @ weights) / (typical @ weights) ** 2 - 1.0), np.float64)
-
-
-def wavelength_step_error(skin: ObservedSkin, step: int) -> Float64Array:
-    """Return each channel's relative error of interreflection at fewer wavelengths.
-
-    Parameters
-    ----------
-    skin
-        The face.
-    step
-        Step through the table's wavelengths.
-
-    Returns
-    -------
-    ndarray
-        Relative, shape (3,): the maximum for light between any two of the face's extremes and
-        centers of melanin and blood, as the mean of products over the mean.
-    """
-    ends = [[part.min(), np.median(part), part.max()] for part in skin.covered_chromophores()]
-    melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
-    spectra = skin.table.spectra(melanin, blood)
-
-    def bounced(every: int) -> Float64Array:
-        some, weights = spectra[:, ::every], skin.band_weights(every)
-        twice = np.einsum("al,bl,lc->abc", some, some, weights)
-        return np.asarray(twice / (some @ weights)[None], np.float64)
-
-    return np.asarray(np.abs(bounced(step) / bounced(1) - 1.0).max(axis=(0, 1)), np.float64)

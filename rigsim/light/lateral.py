@@ -14,7 +14,7 @@ STEPS.
 """
 
 import math
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numba import njit, prange
@@ -26,10 +26,18 @@ from rigsim.geometry.atlas import Atlas
 IMPLICIT_STEPS: Final = 6
 """Implicit steps between two widths."""
 
+MINOR_WEIGHT: Final = 0.05
+MINOR_STEPS: Final = 2
+"""Largest weight in a channel up to which a Gaussian takes fewer implicit steps, and their number:
+2e-4 of the brightest light at most."""
+
 MIN_SIGMA_TEXELS: Final = 0.25
 """Kernels narrower than this fraction of the smallest texel leave the field unchanged."""
 
 COLUMN_BLOCK: Final = 64
+
+_Factors: TypeAlias = tuple[Float32Array, Float32Array, Float32Array]
+"""Factors of a texel's old value, of its predecessor and of its successor, shape (N, N) each."""
 
 
 class LateralError(ValueError):
@@ -62,30 +70,87 @@ def scatter_laterally(
     LateralError
         Shapes disagree, widths do not increase, or weights do not sum to 1.
     """
-    sigma = np.asarray(sigmas_mm, np.float64)
-    weight = np.asarray(weights, np.float64)
     if field.ndim != 3 or field.shape[:2] != atlas.prim.shape:
         raise LateralError(f"field: got shape {field.shape}, expected (N, N, C) of the atlas")
-    if sigma.ndim != 1 or not (np.diff(sigma) > 0).all() or not (sigma > 0).all():
-        raise LateralError(f"sigmas_mm: got {sigma.tolist()}, expected increasing widths > 0")
-    if weight.shape != (field.shape[2], sigma.size) or (weight < 0).any():
-        raise LateralError(f"weights: got shape {weight.shape}, expected (C, K) numbers >= 0")
-    if np.abs(weight.sum(axis=1) - 1.0).max() > 1e-6:
-        raise LateralError(f"weights: got sums {weight.sum(axis=1).tolist()}, expected 1")
-    area, along_u, along_v, smallest_mm = _metric(atlas)
-    state = np.where(atlas.covered[..., None], field, 0.0).astype(np.float32)
-    total = np.zeros_like(state)
-    time = 0.0
-    for k, width in enumerate(sigma):
-        if width > MIN_SIGMA_TEXELS * smallest_mm:
-            step = (0.5 * width * width - time) / IMPLICIT_STEPS
-            for n in range(IMPLICIT_STEPS):
-                order = (_flow_rows, _flow_columns) if n % 2 == 0 else (_flow_columns, _flow_rows)
-                for flow in order:
-                    flow(state, area, along_u if flow is _flow_rows else along_v, step)
+    if np.ndim(weights) != 2 or len(np.asarray(weights)) != field.shape[2]:
+        raise LateralError(
+            f"weights: got shape {np.shape(weights)}, expected (C, K), C = {field.shape[2]}"
+        )
+    return HeatFlow(atlas, sigmas_mm, weights).scatter(field)
+
+
+class HeatFlow:
+    """Lateral scattering on one surface, for many fields.
+
+    The factors of the implicit steps depend on the surface and the widths alone.
+
+    Parameters
+    ----------
+    atlas, sigmas_mm, weights
+        As for `scatter_laterally`.
+
+    Raises
+    ------
+    LateralError
+        Widths do not increase, or weights do not sum to 1.
+    """
+
+    def __init__(self, atlas: Atlas, sigmas_mm: ArrayLike, weights: ArrayLike) -> None:
+        sigma = np.asarray(sigmas_mm, np.float64)
+        self._weight = np.asarray(weights, np.float64)
+        if sigma.ndim != 1 or not (np.diff(sigma) > 0).all() or not (sigma > 0).all():
+            raise LateralError(f"sigmas_mm: got {sigma.tolist()}, expected increasing widths > 0")
+        if (
+            self._weight.ndim != 2
+            or self._weight.shape[1] != sigma.size
+            or (self._weight < 0).any()
+        ):
+            raise LateralError(
+                f"weights: got shape {self._weight.shape}, expected (C, K) numbers >= 0"
+            )
+        if np.abs(self._weight.sum(axis=1) - 1.0).max() > 1e-6:
+            raise LateralError(f"weights: got sums {self._weight.sum(axis=1).tolist()}, expected 1")
+        self._covered = atlas.covered[..., None]
+        area, along_u, along_v, smallest_mm = _metric(atlas)
+        self._stages: list[tuple[int, _Factors, _Factors] | None] = []
+        time = 0.0
+        for k, width in enumerate(sigma):
+            if width <= MIN_SIGMA_TEXELS * smallest_mm:
+                self._stages.append(None)
+                continue
+            is_minor = float(self._weight[:, k].max()) <= MINOR_WEIGHT
+            count = MINOR_STEPS if is_minor else IMPLICIT_STEPS
+            step = (0.5 * width * width - time) / count
+            turned = (np.ascontiguousarray(part.T) for part in (area, along_u))
+            self._stages.append((count, _factorize(*turned, step), _factorize(area, along_v, step)))
             time = 0.5 * width * width
-        total += weight[:, k].astype(np.float32) * state
-    return total
+
+    def scatter(self, field: Float32Array) -> Float32Array:
+        """Convolve a field, see `scatter_laterally`."""
+        if field.shape[2] != len(self._weight):
+            raise LateralError(
+                f"weights: got shape {self._weight.shape}, expected one row for each of "
+                f"{field.shape[2]} channels"
+            )
+        light = np.where(self._covered, field, np.float32(0.0)).astype(np.float32)
+        # rows of the texture are columns of the turned one, along which `_flow` is vectorized
+        state, is_turned = np.ascontiguousarray(np.moveaxis(light, 2, 0)), False
+        total = np.zeros_like(state)
+        for k, stage in enumerate(self._stages):
+            if stage is not None:
+                count, rows, columns = stage
+                for n in range(2 * count):
+                    along_rows = n % 4 in (0, 3)
+                    if along_rows != is_turned:
+                        state, is_turned = _turn(state), along_rows
+                    _flow(state, *(rows if along_rows else columns))
+            part = np.moveaxis(state, 1, 2) if is_turned else state
+            total += self._weight[:, k, None, None].astype(np.float32) * part
+        return np.ascontiguousarray(np.moveaxis(total, 0, 2))
+
+
+def _turn(state: Float32Array) -> Float32Array:
+    return np.ascontiguousarray(np.moveaxis(state, 1, 2))
 
 
 def edge_width_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
@@ -136,54 +201,45 @@ def _metric(atlas: Atlas) -> tuple[Float32Array, Float32Array, Float32Array, flo
 
 
 @njit(parallel=True, cache=True)
-def _flow_rows(field, area, conductance, step):  # type: ignore[no-untyped-def]
-    """Solve one implicit step along the rows in place (Thomas's algorithm)."""
-    # Backward Euler of area dF/dt = div(conductance grad F) gives per row the tridiagonal system
-    # (area + s (c_left + c_right)) F_i - s c_left F_(i-1) - s c_right F_(i+1) = area F_i(old).
+def _factorize(area, conductance, step):  # type: ignore[no-untyped-def]
+    """Factorize one implicit step along the columns (Thomas's algorithm)."""
+    # Backward Euler of area dF/dt = div(conductance grad F) gives per column the tridiagonal system
+    # (area + s (c_up + c_down)) F_i - s c_up F_(i-1) - s c_down F_(i+1) = area F_i(old).
     # Its columns sum to the areas, so that the sum of area times F, the light, is conserved.
-    rows, columns, channels = field.shape
-    for i in prange(rows):
-        ratio = np.empty(columns)
-        left = 0.0
-        for j in range(columns):
-            right = step * conductance[i, j]
-            pivot = area[i, j] + left + right
-            if j > 0:
-                pivot -= left * ratio[j - 1]
-            ratio[j] = right / pivot
-            for c in range(channels):
-                value = area[i, j] * field[i, j, c]
-                if j > 0:
-                    value += left * field[i, j - 1, c]
-                field[i, j, c] = value / pivot
-            left = right
-        for j in range(columns - 2, -1, -1):
-            for c in range(channels):
-                field[i, j, c] += ratio[j] * field[i, j + 1, c]
+    rows, columns = area.shape
+    own, before, after = np.empty_like(area), np.empty_like(area), np.empty_like(area)
+    for j in prange(columns):
+        up, ratio = 0.0, 0.0
+        for i in range(rows):
+            down = step * conductance[i, j]
+            inverse = 1.0 / (area[i, j] + up + down - up * ratio)
+            ratio = down * inverse
+            own[i, j], before[i, j], after[i, j] = area[i, j] * inverse, up * inverse, ratio
+            up = down
+    return own, before, after
 
 
 @njit(parallel=True, cache=True)
-def _flow_columns(field, area, conductance, step):  # type: ignore[no-untyped-def]
+def _flow(field, own, before, after):  # type: ignore[no-untyped-def]
     """Solve one implicit step along the columns in place, a block of columns at a time."""
-    rows, columns, channels = field.shape
-    for block in prange((columns + COLUMN_BLOCK - 1) // COLUMN_BLOCK):
-        first = block * COLUMN_BLOCK
+    channels, rows, columns = field.shape
+    blocks = (columns + COLUMN_BLOCK - 1) // COLUMN_BLOCK
+    for task in prange(channels * blocks):
+        light = field[task % channels]  # neighboring tasks share their factors
+        first = task // channels * COLUMN_BLOCK
         last = min(first + COLUMN_BLOCK, columns)
-        ratio = np.empty((rows, last - first))
-        for i in range(rows):
-            for j in range(first, last):
-                up = step * conductance[i - 1, j] if i > 0 else 0.0
-                down = step * conductance[i, j]
-                pivot = area[i, j] + up + down
-                if i > 0:
-                    pivot -= up * ratio[i - 1, j - first]
-                ratio[i, j - first] = down / pivot
-                for c in range(channels):
-                    value = area[i, j] * field[i, j, c]
-                    if i > 0:
-                        value += up * field[i - 1, j, c]
-                    field[i, j, c] = value / pivot
+        # slices of rows, so that the inner loops are vectorized
+        here = light[0, first:last]
+        scale = own[0, first:last]
+        for j in range(here.shape[0]):
+            here[j] *= scale[j]
+        for i in range(1, rows):
+            last_row, here = light[i - 1, first:last], light[i, first:last]
+            scale, link = own[i, first:last], before[i, first:last]
+            for j in range(here.shape[0]):
+                here[j] = scale[j] * here[j] + link[j] * last_row[j]
         for i in range(rows - 2, -1, -1):
-            for j in range(first, last):
-                for c in range(channels):
-                    field[i, j, c] += ratio[i, j - first] * field[i + 1, j, c]
+            next_row, here = light[i + 1, first:last], light[i, first:last]
+            link = after[i, first:last]
+            for j in range(here.shape[0]):
+                here[j] += link[j] * next_row[j]

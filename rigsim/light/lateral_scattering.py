@@ -12,14 +12,14 @@ import numpy as np
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture
-from rigsim.light import lateral
 from rigsim.light.interreflection import InterreflectionColor, InterreflectionSettings
+from rigsim.light.lateral import HeatFlow
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.subsurface_radiance import pigment_transmittance
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
-from rigsim.render import Caster, visibility
+from rigsim.render import Caster, texture_visibility, visibility
 from rigsim.tissue.skin_layers import ETA
 
 LED_SHADOW_SAMPLES: Final = 4
@@ -60,7 +60,8 @@ class LateralScattering:
             self._color = InterreflectionColor(bounces, skin, surface.r_d, surface.reflectance)
         if subsurface:
             clear = skin.reflectance_without_melanin()
-            self._kernels = skin.lateral_kernels()
+            kernels = skin.lateral_kernels()
+            self._flow = HeatFlow(skin.subject.atlas, kernels.sigmas_mm, kernels.weights)
             self._pigment = pigment_transmittance(surface.reflectance, clear, skin.subject.atlas)
             self._inside = self._pigment * clear
 
@@ -101,9 +102,8 @@ class LateralScattering:
         light = entered[..., None] if came is None else entered[..., None] + came
         light = np.where(covered, light, np.float32(0.0))
         spreading = np.ascontiguousarray(self._inside * light, np.float32)
-        weights = self._kernels.weights
         scale = np.float32(shading.interior_scale(ETA))
-        skin = lateral.scatter_laterally(spreading, atlas, self._kernels.sigmas_mm, weights)
+        skin = self._flow.scatter(spreading)
         hair = subject.hair[..., None]
         over = hair * np.asarray(HAIR_REFLECTANCE, np.float32) * light
         return dilate_texture(scale * ((1.0 - hair) * self._pigment * skin + over), atlas.covered)
@@ -125,14 +125,15 @@ def entering_irradiance(
     lamp
         The light.
     position_mm, normal, mesh_normal
-        Points, their normals with relief, and those of the mesh, shape (..., 3).
+        Points, their normals with relief, and those of the mesh, shape (N, N, 3), or (1, n, 3)
+        without neighborhood.
 
     Returns
     -------
     ndarray of float32
         Shape (...).
     """
-    seen = visibility(
+    seen = (texture_visibility if position_mm.shape[0] > 1 else visibility)(
         caster,
         position_mm,
         mesh_normal,

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from rigsim.arrays import Float32Array
+from rigsim.arrays import BoolArray, Float32Array, Int64Array
 from rigsim.light.surface_brdf import transmittance
 from rigsim.subject import SimulatedSubject
 
@@ -87,9 +87,11 @@ class ReliefShadow:
     ----------
     subject
         The face in its pose.
+    directions
+        Number of directions with horizons.
     """
 
-    def __init__(self, subject: SimulatedSubject) -> None:
+    def __init__(self, subject: SimulatedSubject, directions: int = HORIZON_DIRECTIONS) -> None:
         atlas = subject.atlas
         self._du, self._dv = atlas.dp_du_mm, atlas.dp_dv_mm
         self._size = atlas.size
@@ -97,12 +99,19 @@ class ReliefShadow:
         # um per texel; each texel's own frame gives its length along each direction
         self._horizon = np.stack(
             [
-                horizon_tangent(
-                    height, pixel_um=1.0, azimuth_rad=2.0 * math.pi * k / HORIZON_DIRECTIONS
-                )
-                for k in range(HORIZON_DIRECTIONS)
+                horizon_tangent(height, pixel_um=1.0, azimuth_rad=2.0 * math.pi * k / directions)
+                for k in range(directions)
             ]
         )
+
+    def highest_horizons(self, covered: BoolArray, count: int) -> tuple[Int64Array, Int64Array]:
+        """Return rows and columns of the covered texels with the highest horizons, (n,) each."""
+        longest = np.sqrt(np.sum(self._du**2, axis=-1)), np.sqrt(np.sum(self._dv**2, axis=-1))
+        texel = np.maximum(np.minimum(*longest), np.float32(1e-6))
+        slope = np.where(covered, self._horizon.max(axis=0) / texel, np.float32(0.0))
+        found = np.argsort(slope, axis=None)[-count:]
+        row, column = np.unravel_index(found[slope.reshape(-1)[found] > 0.0], slope.shape)
+        return row, column
 
     def visible_fraction(
         self,

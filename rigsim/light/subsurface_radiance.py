@@ -15,7 +15,7 @@ from rigsim.light.interreflection import InterreflectionColor, InterreflectionSe
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
-from rigsim.render import Caster, visibility
+from rigsim.render import Caster, texture_visibility
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.lateral_kernels import GaussianSum
 from rigsim.tissue.skin_layers import ETA
@@ -59,6 +59,9 @@ class SubsurfaceRadiance:
     """The same with lateral scattering unless omitted, and behind hair."""
     kernels: GaussianSum
     """Lateral profile of each channel for the face's typical skin."""
+    pigment: Float32Array | None
+    """Transmittance of the pigment, see `pigment_transmittance`; None without lateral
+    scattering."""
 
 
 def illuminate_surface(
@@ -96,20 +99,19 @@ def illuminate_surface(
     size = atlas.size
     position = atlas.position_mm.reshape(-1, 3)
     normal = subject.normal.reshape(-1, 3)
-    mesh_normal = atlas.normal.reshape(-1, 3)
     visible = np.empty((size * size, len(lights)), np.float32)
     shadows = None if relief is None else np.ones_like(visible)
     irradiance = np.zeros(size * size, np.float32)
     entered = np.zeros(size * size, np.float32)
     for k, light in enumerate(lights):
-        visible[:, k] = visibility(
+        visible[:, k] = texture_visibility(
             caster,
-            position,
-            mesh_normal,
+            atlas.position_mm,
+            atlas.normal,
             light.position_mm,
             radius_mm=light.radius_mm,
             samples=FLASH_SHADOW_SAMPLES,
-        )
+        ).reshape(-1)
         if relief is not None and shadows is not None:
             shadows[:, k] = relief.on_texture(
                 atlas.position_mm, light.position_mm, radius_mm=light.radius_mm
@@ -194,16 +196,19 @@ def render_subsurface_radiance(
         within = within + np.where(covered[..., None], came, np.float32(0.0))
     sharp = scale * within * reflectance
     kernels = skin.lateral_kernels()
-    spread = sharp
+    spread, pigment = sharp, None
     if lateral_transport:
-        spread = scale * scatter_through_pigment(skin, reflectance, within, kernels)
+        pigment = pigment_transmittance(
+            reflectance, skin.reflectance_without_melanin(), subject.atlas
+        )
+        spread = scale * scatter_through_pigment(skin, pigment, within, kernels)
     # Hair is dark and matt, and transmits no light to the skin below it.
     spread = (1.0 - hair) * spread + scale * within * covering
-    return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels)
+    return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels, pigment)
 
 
 def scatter_through_pigment(
-    skin: ObservedSkin, reflectance: Float32Array, entered: Float32Array, kernels: GaussianSum
+    skin: ObservedSkin, pigment: Float32Array, entered: Float32Array, kernels: GaussianSum
 ) -> Float32Array:
     """Return the light that leaves after lateral scattering, per unit of the interior's scale.
 
@@ -211,8 +216,8 @@ def scatter_through_pigment(
     ----------
     skin
         The face.
-    reflectance
-        Sharp reflectance, shape (N, N, 3).
+    pigment
+        Transmittance of its pigment, see `pigment_transmittance`, shape (N, N, 3).
     entered
         Light that enters, shape (N, N[, 3]).
     kernels
@@ -228,7 +233,7 @@ def scatter_through_pigment(
     scatter_patterned_light : the method and its accuracy.
     """
     without = skin.reflectance_without_melanin()
-    return scatter_patterned_light(reflectance, without, entered, skin.subject.atlas, kernels)
+    return _scatter_inside(pigment, without, entered, skin.subject.atlas, kernels)
 
 
 def scatter_patterned_light(
@@ -269,6 +274,16 @@ def scatter_patterned_light(
     lateral scattering it is 6.3 % on the six, with a blurred reflectance 3.7 %.
     """
     pigment = pigment_transmittance(reflectance, without_melanin, atlas)
+    return _scatter_inside(pigment, without_melanin, entered, atlas, kernels)
+
+
+def _scatter_inside(
+    pigment: Float32Array,
+    without_melanin: Float32Array,
+    entered: Float32Array,
+    atlas: Atlas,
+    kernels: GaussianSum,
+) -> Float32Array:
     light = entered if entered.ndim == 3 else entered[..., None]
     inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
     return pigment * lateral.scatter_laterally(inside, atlas, kernels.sigmas_mm, kernels.weights)

@@ -19,11 +19,12 @@ analyzer. No image of a single LED is stored. `mi.render` returns 16 channels:
 - 12 to 15: four sums of the entering light, cosine included.
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.mitsuba.image_hits import HitBand, ImageHits
 from rigsim.mitsuba.olat import define_olat
 from rigsim.mitsuba.plugin_class import define_plugin
@@ -53,8 +54,19 @@ class _LedMoments:
                 f"expected finite (N, {MOMENT_COUNT})"
             )
 
-    def image(self, scene: Any, sensor: Any) -> Float32Array:
-        """Return the image of a camera, (H, W, 16)."""
+    def image(
+        self, scene: Any, sensor: Any, is_hidable: Callable[[int], BoolArray] | None = None
+    ) -> Float32Array:
+        """Return the image of a camera, (H, W, 16).
+
+        Parameters
+        ----------
+        scene, sensor
+            The scene and its camera.
+        is_hidable
+            Returns for an LED the pixels in which something may hide it, shape (H, W): others get
+            no shadow ray. None: all pixels.
+        """
         emitter = next((e for e in scene.emitters() if hasattr(e, "toward")), None)
         if emitter is None or emitter.count != len(self.weights):
             raise ValueError(
@@ -69,11 +81,17 @@ class _LedMoments:
         right = self.mi.Vector3f(*(float(-c) for c in matrix[:3, 0]))  # local +x is left
         out = np.zeros((hits.shape[0] * hits.shape[1], CHANNEL_COUNT), np.float32)
         for band in hits.bands:
-            out[band.pixel] = self._band(scene, hits, band, emitter, right)
+            out[band.pixel] = self._band(scene, hits, band, emitter, right, is_hidable)
         return out.reshape(*hits.shape, CHANNEL_COUNT)
 
     def _band(
-        self, scene: Any, hits: ImageHits, band: HitBand, emitter: Any, right: Any
+        self,
+        scene: Any,
+        hits: ImageHits,
+        band: HitBand,
+        emitter: Any,
+        right: Any,
+        is_hidable: Callable[[int], BoolArray] | None,
     ) -> Float32Array:
         """Return the mean over whole pixels of a band, shape (P, 16)."""
         mi, dr = self.mi, self.dr
@@ -84,8 +102,12 @@ class _LedMoments:
             return [*stokes, entered], lit
 
         sums = [mi.Float(0.0)] * CHANNEL_COUNT
+        owner = np.repeat(band.pixel, np.diff(band.first))
         for led, weights in enumerate(self.weights):
-            seen = self._reflected(scene, band, emitter, led, None, reflect, STOKES_COUNT + 1)
+            tested = None if is_hidable is None else is_hidable(led).reshape(-1)[owner]
+            seen = self._reflected(
+                scene, band, emitter, led, None, reflect, STOKES_COUNT + 1, tested
+            )
             strength = float(emitter.strength(led).mean())
             moments = [dr.opaque(mi.Float, strength * float(w)) for w in weights]
             terms = [w * s for w in moments for s in seen[:STOKES_COUNT]]

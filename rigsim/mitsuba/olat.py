@@ -26,7 +26,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigsim.arrays import Float32Array, Int32Array
+from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.mitsuba.image_hits import NOTHING_ADDED, AddedLight, HitBand, ImageHits
 from rigsim.mitsuba.led_array import DISC_POINTS, disc_points
 from rigsim.mitsuba.memory import pad_memory
@@ -321,10 +321,12 @@ class _Olat:
         visible: Float32Array | None,
         reflect: Callable[[Any, Any, FilmedLight], tuple[list[Any], Any]],
         channels: int = 3,
+        is_hidable: BoolArray | None = None,
     ) -> list[Any]:
         """Return channels that `reflect` gives for `skincoat`, times the light that arrives.
 
-        Other BSDFs reflect in the first three channels.
+        Other BSDFs reflect in the first three channels. Only hits that are hidable, shape (n,),
+        get a shadow ray; None: all.
         """
         mi, dr = self.mi, self.dr
         slot = dr.arange(mi.UInt32, band.count) % DISC_POINTS
@@ -344,14 +346,34 @@ class _Olat:
             facing |= here
             total = [dr.select(here, c, t) for t, c in zip(total, values, strict=True)]
         active &= facing
-        if self.shadows:
+        if self.shadows and is_hidable is None:
             ray = mi.Ray3f(band.start, target / far)
             ray.maxt = 0.999 * far
             active &= ~scene.ray_test(ray, True, active)
+        elif self.shadows and is_hidable is not None:
+            active &= ~self._is_blocked(scene, band, emitter, light, is_hidable)
         if visible is not None:
             strength *= _upload(mi, visible)
         arriving = [*strength, *[dr.mean(strength)] * (channels - 3)]
         return [dr.select(active, t * s, 0.0) for t, s in zip(total, arriving, strict=True)]
+
+    def _is_blocked(
+        self, scene: Any, band: HitBand, emitter: Any, light: int, is_hidable: BoolArray
+    ) -> Any:
+        """Return which hits do not see a light; only hidable ones get a ray, in own packets."""
+        mi, dr = self.mi, self.dr
+        blocked = dr.zeros(mi.Bool, band.count)
+        if not is_hidable.any():
+            return blocked
+        which = _indices(mi, np.flatnonzero(is_hidable).astype(np.int32))
+        start = mi.Point3f(*(dr.gather(mi.Float, part, which) for part in band.start))
+        u, v = (dr.gather(mi.Float, points, which % DISC_POINTS) for points in self._disc)
+        _, target, _ = _toward(mi, dr, emitter, light, start, u, v)
+        far = dr.norm(target)
+        ray = mi.Ray3f(start, target / far)
+        ray.maxt = 0.999 * far
+        dr.scatter(blocked, scene.ray_test(ray, True), which)
+        return blocked
 
 
 def define_olat(mi: Any) -> Any:

@@ -7,9 +7,18 @@ import numpy as np
 from capture.rig import Rig, Vector, View
 from model import spectra
 from rigsim.arrays import FloatArray
+from rigsim.light.led_light import white_intensity
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import max_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, decide_effect, omitted_effects
+from rigsim.needs.effects import (
+    Effect,
+    EffectSelection,
+    NeedsError,
+    PixelNoise,
+    decide_effect,
+    omitted_effects,
+)
+from rigsim.needs.sampled_light import LitFace, SampledLamp, SampledLight, sample_light
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -22,6 +31,7 @@ def select_dome_effects(
     state: str,
     scenery: face.ViewingConditions,
     white_rgb: FloatArray | None,
+    light: SampledLight | None,
     movement: bool,
     motion: HeadMotion | None,
 ) -> EffectSelection:
@@ -38,6 +48,9 @@ def select_dome_effects(
     white_rgb
         Signal of a white plate at the origin in the plan's longest exposure from the brightest
         light, full scales, shape (3,); None: the brightest skin is at full scale.
+    light
+        Direct light of each lamp on a face, relative to that of the brightest on a plate at the
+        origin; None for a target.
     movement, motion
         Whether the face moves with its state, and the movement of the head.
     """
@@ -53,16 +66,19 @@ def select_dome_effects(
         ]
         made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject.name} is opaque"))
         return EffectSelection((*made, *omitted_effects("dome", "glare")))
+    if light is None:
+        raise NeedsError("light: got none, expected that on a face; sample it")
     skin = scenery.observe_skin(subject, state)
-    brightest = face.max_reflectance_rgb(skin)
     if white_rgb is None:
         white = spectra.camera_white(view.spectral_sensitivity, scenery.illuminant)
-        level = white * brightest / (white * brightest).max()
+        lit = LitFace.expose(skin, light, white, to_full_scale=True)
+        level = white * lit.brightest / (white * lit.brightest).max()
     else:
-        near = max(_max_brightness_gain(scenery.caster, light.position_mm) for light in rig.lights)
-        level = near * white_rgb * brightest
+        lit = LitFace.expose(skin, light, np.asarray(white_rgb, np.float64))
+        near = max(_max_brightness_gain(scenery.caster, one.position_mm) for one in rig.lights)
+        level = near * white_rgb * lit.brightest
     made += face.select_face_effects(
-        skin, scenery, brightest, level=level, peak=1.0, finer=False, lateral_switch="subsurface"
+        lit, scenery, level=level, finer=False, lateral_switch="subsurface"
     )
     made += _movement(subject, movement, motion, view)
     made += omitted_effects("dome", "dome_face")
@@ -72,6 +88,27 @@ def select_dome_effects(
     if face.LATERAL_EFFECT in built:
         made += omitted_effects("dome_lateral")
     return EffectSelection(tuple(made))
+
+
+def sample_led_light(
+    rig: Rig, subject: SimulatedSubject | Target, caster: Caster
+) -> SampledLight | None:
+    """Return the light of each LED on a face, over that of the brightest on a plate at the origin.
+
+    None for a target.
+    """
+    if not isinstance(subject, SimulatedSubject):
+        return None
+    view = rig.views[0]
+    strength = np.array([float(white_intensity(light, view).max()) for light in rig.lights])
+    squared = np.array([float(np.square(light.position_mm).sum()) for light in rig.lights])
+    weights = strength / (strength / squared).max()
+    lamps = [
+        [SampledLamp(light.position_mm, light.radius_mm, float(weight))]
+        for light, weight in zip(rig.lights, weights, strict=True)
+    ]
+    cameras = np.array([view.position_mm for view in rig.views])
+    return sample_light(subject, caster, lamps, cameras)
 
 
 def _movement(

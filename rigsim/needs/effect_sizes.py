@@ -9,12 +9,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigsim.arrays import Float64Array, FloatArray
+from rigsim.arrays import Float64Array
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection
-from rigsim.needs.effects import PixelNoise
 from rigsim.render import Caster
-from rigsim.tissue.skin_layers import ETA
 
 EXCHANGE_PATCHES = 32
 """Texels along one side of the coarse texture on which exchange between skin is estimated."""
@@ -64,40 +62,24 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
     return np.asarray(weight @ mean, np.float64)
 
 
-def scattering_over_noise(lost: ArrayLike, level: ArrayLike, noise: PixelNoise) -> Float64Array:
-    """Return the change of a pixel by lateral scattering across a shadow's edge, over its noise.
-
-    Parameters
-    ----------
-    lost
-        Fraction of a lit pixel's light lost across the edge, see `edge_loss`, shape (C,).
-    level
-        The brightest pixel's signal, full scales, shape (C,); it may exceed 1.
-    noise
-        Noise of the sensor.
-
-    Returns
-    -------
-    ndarray
-        Shape (C,). The pixel beyond the edge gains the lit pixel's loss. Where no other light
-        reaches it, this gain is its whole signal, and its noise is the least.
-
-    Examples
-    --------
-    >>> scattering_over_noise([0.1], [0.5], PixelNoise(1e-4, 0.0)).round(3).tolist()
-    [22.361]
-    """
-    gained = np.minimum(np.asarray(lost, np.float64) * np.asarray(level, np.float64), 1.0)
-    return np.asarray(gained / noise.sigma(gained), np.float64)
-
-
-def max_exchange_fraction(caster: Caster) -> float:
-    """Bound the fraction of the light leaving a surface that falls back onto its hollows.
+def coarse_exchange(caster: Caster) -> Interreflection | None:
+    """Return the exchange of light between coarse patches of a surface; None: it is flat.
 
     Parameters
     ----------
     caster
         The mesh; its texture coordinates must not overlap.
+    """
+    return None if is_flat(caster.mesh) else Interreflection(caster, patches=EXCHANGE_PATCHES)
+
+
+def max_exchange_fraction(exchange: Interreflection | None) -> float:
+    """Bound the fraction of the light leaving a surface that falls back onto its hollows.
+
+    Parameters
+    ----------
+    exchange
+        Exchange between its patches, see `coarse_exchange`.
 
     Returns
     -------
@@ -105,11 +87,9 @@ def max_exchange_fraction(caster: Caster) -> float:
         The largest sum over patches of the exchange with one patch for a reflectance of 1, 0 to 1;
         0 for a flat or convex surface.
     """
-    if is_flat(caster.mesh):
+    if exchange is None:
         return 0.0
-
-    exchange = Interreflection(caster, patches=EXCHANGE_PATCHES).exchange
-    return float(np.asarray(exchange.sum(axis=1)).max(initial=0.0))
+    return float(np.asarray(exchange.exchange.sum(axis=1)).max(initial=0.0))
 
 
 def is_flat(mesh: Mesh) -> bool:
@@ -141,17 +121,6 @@ def interreflection_over_direct(exchange_fraction: float, reflectance: float) ->
             "expected 0 to 1"
         )
     return once / (1.0 - once)
-
-
-def max_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
-    """Return the steepest slope of a relief; lights above that elevation are not shadowed.
-
-    Examples
-    --------
-    >>> max_slope(np.array([3.0, 0.0]), np.array([4.0, 0.0]))
-    5.0
-    """
-    return float(np.hypot(slope_x, slope_y).max(initial=0.0))
 
 
 def max_irradiance(mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
@@ -189,53 +158,3 @@ def max_irradiance(mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike) 
         squared = float(np.min(np.sum((place - points) ** 2, axis=1)))
         total += float(weight) / max(squared, 1e-12)
     return total
-
-
-def max_highlight(
-    mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
-) -> float:
-    """Bound the specular reflection of a surface over the light of a white plate.
-
-    Parameters
-    ----------
-    mesh
-        The surface.
-    positions_mm, weights_mm2
-        Lights, see `max_irradiance`.
-    camera_mm
-        The camera, shape (3,).
-    alpha
-        The smallest GGX roughness, 0 to 1.
-
-    Notes
-    -----
-    For the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
-    ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
-    perpendicular to the plane of incidence, at half the largest angle between light and camera; an
-    analyzer transmits all of such light, and half of a plate's.
-
-    Examples
-    --------
-    >>> from rigsim.geometry.mesh import build_mesh
-    >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
-    >>> bound = max_highlight(plate, [[0, 0, 1e4]], [1e8], [0, 0, 1e4], 0.5)
-    >>> round(bound / (2.0 * (0.4 / 2.4) ** 2 / (2.0 * 0.5**3)), 3)
-    1.0
-    """
-    points = np.asarray(mesh.vertices_mm, np.float64)
-    to_camera = np.asarray(camera_mm, np.float64) - points
-    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    total = 0.0
-    for place, weight in zip(
-        np.asarray(positions_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
-    ):
-        to_light = place - points
-        to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
-        between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
-        # The angle of incidence is half the angle between light and camera:
-        # cos^2(x / 2) = (1 + cos x) / 2.
-        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))
-        inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
-        across = ((cosine - inside) / (cosine + inside)) ** 2
-        total += 2.0 * across * max_irradiance(mesh, [place], [weight])
-    return total / (2.0 * alpha**3)

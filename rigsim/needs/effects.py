@@ -167,6 +167,9 @@ class Effect:
     """Largest change of a pixel over its noise by the scene's rule; None: the rule needs none."""
     switch: str = ""
     """Argument of `SceneEffects.from_switches` that switches the effect; empty: none."""
+    choice: float | None = None
+    """Value of a numeric switch by the scene's rule, such as a step through wavelengths; None: the
+    switch is none of them."""
 
     def __post_init__(self) -> None:
         """Refuse a verdict that contradicts the size."""
@@ -284,7 +287,13 @@ def _priority(effect: Effect) -> tuple[bool, float]:
 
 
 def decide_effect(
-    name: str, over_noise: float, requested: bool | None, *, switch: str, reason: str
+    name: str,
+    over_noise: float,
+    requested: bool | None,
+    *,
+    switch: str,
+    reason: str,
+    choice: float | None = None,
 ) -> Effect:
     """Decide whether a scene builds an effect: as requested, or by its size.
 
@@ -300,6 +309,8 @@ def decide_effect(
         See `Effect.switch`.
     reason
         Source of the size.
+    choice
+        See `Effect.choice`.
 
     Examples
     --------
@@ -315,15 +326,15 @@ def decide_effect(
     size = f"{reason}: up to {over_noise:.3g} times the noise"
     if requested is None:
         verdict: Verdict = "built" if over_noise >= NEGLIGIBLE_NOISE_RATIO else "negligible"
-        return Effect(name, verdict, size, over_noise, switch)
+        return Effect(name, verdict, size, over_noise, switch, choice)
     if requested:
         text = (
             size if over_noise >= NEGLIGIBLE_NOISE_RATIO else f"{switch}=True requests it; {size}"
         )
-        return Effect(name, "built", text, over_noise, switch)
+        return Effect(name, "built", text, over_noise, switch, choice)
     if over_noise < NEGLIGIBLE_NOISE_RATIO:
-        return Effect(name, "negligible", size, over_noise, switch)
-    return Effect(name, "asked", f"{switch}=False requests it; {size}", over_noise, switch)
+        return Effect(name, "negligible", size, over_noise, switch, choice)
+    return Effect(name, "asked", f"{switch}=False requests it; {size}", over_noise, switch, choice)
 
 
 def max_on_time_s(plan: Plan) -> float | None:

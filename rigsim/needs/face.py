@@ -1,5 +1,7 @@
 """Select the effects of light that images of a face require in every rig."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -8,13 +10,10 @@ import numpy as np
 
 from capture.rig import Rig, View
 from rigsim.arrays import Float64Array, FloatArray
-from rigsim.light.interreflection import (
-    WAVELENGTH_STEPS,
-    channel_approximation_error,
-    wavelength_step_error,
-)
+from rigsim.light.interreflection import WAVELENGTH_STEPS, Interreflection
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.needs.effect_sizes import edge_loss, interreflection_over_direct, scattering_over_noise
+from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.needs.effect_sizes import edge_loss, interreflection_over_direct, max_exchange_fraction
 from rigsim.needs.effects import (
     NEGLIGIBLE_NOISE_RATIO,
     Effect,
@@ -22,9 +21,18 @@ from rigsim.needs.effects import (
     SceneEffects,
     decide_effect,
 )
+from rigsim.needs.sampled_light import (
+    BOUNCE_CANDIDATES,
+    EXACT_BOUNCE_FRACTION,
+    LitFace,
+    SampledBounces,
+    blur_over_noise,
+    scattering_over_noise,
+)
+from rigsim.needs.sampled_relief import relief_shadows_over_noise
 from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render import Caster
-from rigsim.render.depth_of_field import depth_range, tabulate_defocus
+from rigsim.render.depth_of_field import depth_before_focus, depth_range, tabulate_defocus
 from rigsim.subject import SimulatedSubject
 
 LATERAL_EFFECT = "lateral scattering in skin"
@@ -40,11 +48,8 @@ RELIEF_EFFECT = "relief of the skin"
 PIGMENT_EFFECT = "pattern of pigment"
 RELIEF_SHADOW_EFFECT = "shadows of relief"
 
-TEXEL_STEP = 16
-"""Every n-th texel's reflectance is evaluated."""
-
-MAX_LAST_BOUNCE = 1e-3
-"""Upper limit of the last summed bounce relative to the first."""
+RULE_DIRECTIONS = 12
+"""Number of directions with horizons of the relief, for the size of its shadows."""
 
 MIN_PIGMENT_CONTRAST = 1e-5
 MIN_RELIEF_TILT_DEG = 1e-3
@@ -52,7 +57,13 @@ MIN_RELIEF_TILT_DEG = 1e-3
 is at most a few thousand times the noise, of which a tenth counts."""
 
 MAX_REMAINING_NOISE_RATIO = 0.05
-"""Approximate limit of the remaining bounces, relative to the noise."""
+"""Limit of the remaining bounces, relative to the noise."""
+
+BOUNCE_MARGIN = 2.0
+STEP_MARGIN = 4.0
+LATERAL_MARGIN = 0.6
+LENS_MARGIN = 0.6
+"""Factors on the sizes of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +75,8 @@ class ViewingConditions:
     """Spectrum of the lights."""
     caster: Caster
     """Caster of the mesh."""
-    exchange_fraction: float
-    """`max_exchange_fraction` of the mesh."""
+    exchange: Interreflection | None
+    """`coarse_exchange` of the mesh; None: it is flat."""
     noise: PixelNoise
     """Noise of the sensor."""
     effects: SceneEffects
@@ -79,12 +90,10 @@ class ViewingConditions:
 
 
 def select_face_effects(
-    skin: ObservedSkin,
+    face: LitFace,
     scenery: ViewingConditions,
-    peak_reflectance: Float64Array,
     *,
     level: FloatArray,
-    peak: float,
     finer: bool,
     lateral_switch: str = "lateral",
 ) -> list[Effect]:
@@ -92,42 +101,25 @@ def select_face_effects(
 
     Parameters
     ----------
-    skin, scenery
+    face, scenery
         The face, and the viewing conditions of its camera.
-    peak_reflectance
-        Its `max_reflectance_rgb`.
     level
         Signal of its brightest skin, full scales, shape (3,).
-    peak
-        Signal of its brightest highlight, full scales.
     finer
         Whether the wavelengths of interreflection can be thinned out.
     lateral_switch
         Name of the switch of lateral scattering.
     """
-    noise, share, effects = scenery.noise, scenery.exchange_fraction, scenery.effects
+    noise, effects, skin = scenery.noise, scenery.effects, face.skin
     pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
     kernels = skin.lateral_kernels()
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
-    bounced = np.array([interreflection_over_direct(share, float(r)) for r in peak_reflectance])
-    more = np.minimum(level * bounced, 1.0)
-    unseen = more / noise.sigma(more)  # where no direct light arrives, the noise is least
-    bounces = decide_effect(
-        INTERREFLECTION_EFFECT,
-        float(unseen.max()),
-        effects.interreflections,
-        switch="interreflections",
-        reason=f"hollows receive {100 * share:.0f} % of what their surroundings send out",
-    )
-    off = float((unseen * channel_approximation_error(skin)).max()) if bounces.is_built else 0.0
-    why = "a channel's mean of squares differs from the square of its mean"
-    why = why if bounces.is_built else "interreflection is absent"
-    asked = effects.spectral
-    spectral = off >= NEGLIGIBLE_NOISE_RATIO if asked is None else asked
-    thinned = (
-        [_wavelength_step_effect(bounces, spectral, choose_spectral_step(skin, bounces))]
-        if finer
-        else []
+    bounced = interreflection_effects(face, scenery, finer=finer)
+    share = max_exchange_fraction(scenery.exchange)
+    gain = np.array([interreflection_over_direct(share, float(r)) for r in face.brightest])
+    images = range(len(face.white))
+    scattered = LATERAL_MARGIN * max(
+        scattering_over_noise(face.diffuse(k), face.light, lost, noise) for k in images
     )
     return [
         *texture_effects(skin),
@@ -136,27 +128,70 @@ def select_face_effects(
             scenery,
             level=level,
             lost=lost if effects.lateral is not False else np.zeros_like(lost),
-            gain=1.0 + bounced if bounces.is_built else np.ones_like(bounced),
+            gain=1.0 + gain if bounced[0].is_built else np.ones_like(gain),
         ),
         Effect(
             SHADOW_EFFECT,
             "built",
             "a face shades itself",
-            noise.change_over_noise(1.0, min(peak, 1.0)),
+            noise.change_over_noise(1.0, min(face.peak, 1.0)),
         ),
         decide_effect(
             LATERAL_EFFECT,
-            float(scattering_over_noise(lost, level, noise).max()),
+            scattered,
             effects.lateral,
             switch=lateral_switch,
             reason=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
+        *bounced,
+        face_lens_effect(face, scenery),
+        relief_shadow_effect(face, scenery),
+    ]
+
+
+def interreflection_effects(
+    face: LitFace, scenery: ViewingConditions, *, finer: bool
+) -> list[Effect]:
+    """Return interreflection, its color, its wavelengths if these are ``finer``, and its end."""
+    effects = scenery.effects
+    share = max_exchange_fraction(scenery.exchange)
+    why = f"hollows receive {100 * share:.0f} % of what their surroundings send out"
+    found, size, none = None, 0.0, 0.0
+    if scenery.exchange is not None:
+        found = SampledBounces(
+            face.skin, scenery.exchange, face.light, face.white, scenery.noise, face.reflectance
+        )
+        plain = found.arriving(spectral=False)
+        size = BOUNCE_MARGIN * found.over_noise(plain)
+    bounces = decide_effect(
+        INTERREFLECTION_EFFECT,
+        size,
+        effects.interreflections,
+        switch="interreflections",
+        reason=why,
+    )
+    if found is None or not bounces.is_built:
+        why = "interreflection is absent"
+        steps = [Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, none, "spectral_step")]
+        return [
+            bounces,
+            decide_effect(SPECTRAL_EFFECT, none, effects.spectral, switch="spectral", reason=why),
+            *(steps if finer else []),
+            Effect(FURTHER_BOUNCES_EFFECT, "negligible", why, none, "last_bounce"),
+        ]
+    exact = found.arriving(spectral=True)
+    spectral = decide_effect(
+        SPECTRAL_EFFECT,
+        BOUNCE_MARGIN * found.over_noise(exact, plain),
+        effects.spectral,
+        switch="spectral",
+        reason="a channel's mean of squares differs from the square of its mean",
+    )
+    return [
         bounces,
-        decide_effect(SPECTRAL_EFFECT, off, asked, switch="spectral", reason=why),
-        *thinned,
-        further_bounces_effect(bounces, share * float(peak_reflectance.max())),
-        lens_effect(scenery, peak),
-        relief_shadow_effect(skin.subject, scenery, peak),
+        spectral,
+        *([_wavelength_step_effect(found, exact, spectral)] if finer else []),
+        _further_bounces_effect(found),
     ]
 
 
@@ -169,25 +204,55 @@ def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Ef
     return Effect(name, "built", "the state moves the face", switch="movement")
 
 
-def relief_shadow_effect(
-    subject: SimulatedSubject, scenery: ViewingConditions, level: float
-) -> Effect:
+def relief_shadow_effect(face: LitFace, scenery: ViewingConditions) -> Effect:
     """Return whether the relief of a face shadows itself."""
+    subject = face.skin.subject
     covered = subject.atlas.covered
     across, along = (mm[covered] for mm in subject.atlas.texel_mm())
     down, right = (
         np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
     )
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
-    # Light at the elevation of the steepest slope s has irradiance sin(elevation) =
-    # s / sqrt(1 + s^2), and the relief may hide all of it.
-    most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
+    pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
+    size = relief_shadows_over_noise(
+        subject,
+        scenery.caster,
+        ReliefShadow(subject, RULE_DIRECTIONS),
+        face.light,
+        face.reflectance,
+        face.white,
+        scenery.noise,
+        pixel_mm,
+    )
     return decide_effect(
         RELIEF_SHADOW_EFFECT,
-        most / float(scenery.noise.sigma(0.0)),
+        size,
         scenery.effects.relief_shadows,
         switch="relief_shadows",
         reason=f"relief as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
+    )
+
+
+def face_lens_effect(face: LitFace, scenery: ViewingConditions) -> Effect:
+    """Return whether the lens blurs a face: at the edges of its light, and at its outline."""
+    view = scenery.view
+    depths = depth_range(view, scenery.caster.mesh)
+    spread = tabulate_defocus(
+        view, scenery.illuminant, subpixels=scenery.subpixels, depths_mm=depths
+    )
+    toward = depth_before_focus(view, face.light.position_mm)
+    spilled = spread.spilled_fraction(toward)
+    size = LENS_MARGIN * max(
+        blur_over_noise(face.diffuse(k) + face.highlight(k), face.light, spilled, scenery.noise)
+        for k in range(len(face.white))
+    )
+    most = 100.0 * float(spilled[face.light.visible].max(initial=0.0))
+    return decide_effect(
+        LENS_EFFECT,
+        size,
+        scenery.effects.optics,
+        switch="optics",
+        reason=f"at f/{view.f_number:g}, {most:.0f} % of a pixel's light falls on others",
     )
 
 
@@ -284,72 +349,43 @@ def _tissue_effects(
     return select_tissue_effects(skin.subject.tissue, change, scenery.effects)
 
 
-def max_reflectance_rgb(skin: ObservedSkin) -> Float64Array:
-    """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
-    rgb = skin.reflectance()[skin.subject.atlas.covered][::TEXEL_STEP]
-    return np.asarray(rgb.max(axis=0), np.float64)
-
-
-def choose_min_bounce_fraction(over_noise: float) -> float:
-    """Return the fraction of the first bounce at which the sum ends, from the bounces' size.
-
-    Examples
-    --------
-    >>> choose_min_bounce_fraction(0.5), choose_min_bounce_fraction(500.0)
-    (0.001, 0.0001)
-    """
-    return min(MAX_LAST_BOUNCE, MAX_REMAINING_NOISE_RATIO / max(over_noise, 1e-9))
-
-
-def choose_spectral_step(skin: ObservedSkin, bounces: Effect) -> tuple[int, float]:
-    """Return the largest wavelength step of interreflection that changes no pixel.
-
-    Returns
-    -------
-    step, over_noise
-        The step, as every n-th of the table's wavelengths, with its largest change of a pixel over
-        the noise; 1 and the change of the smallest larger step, where every larger step changes a
-        pixel.
-    """
-    size = float(bounces.over_noise or 0.0)
-    change = math.inf
-    for step in WAVELENGTH_STEPS:
-        change = size * float(wavelength_step_error(skin, step).max())
-        if change < NEGLIGIBLE_NOISE_RATIO:
-            return step, change
-    return 1, change
-
-
-def _wavelength_step_effect(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
+def _wavelength_step_effect(found: SampledBounces, exact: Float64Array, spectral: Effect) -> Effect:
     """Return whether interreflection requires all of the table's wavelengths."""
-    step, over_noise = found
-    if not (bounces.is_built and spectral):
-        why = "interreflection is absent" if not bounces.is_built else "channels are taken whole"
-        return Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, 0.0, "spectral_step")
-    nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
+    if not spectral.is_built:
+        return Effect(
+            WAVELENGTH_STEP_EFFECT, "negligible", "channels are taken whole", 0.0, "spectral_step"
+        )
+    change, chosen = math.inf, 1
+    for step in WAVELENGTH_STEPS:
+        change = STEP_MARGIN * found.over_noise(exact, found.arriving(spectral=True, step=step))
+        if change < NEGLIGIBLE_NOISE_RATIO:
+            chosen = step
+            break
+    nm = f"each {10 * chosen} nm are enough" if chosen > 1 else "each 20 nm would not be enough"
     return decide_effect(
-        WAVELENGTH_STEP_EFFECT, over_noise, None, switch="spectral_step", reason=nm
+        WAVELENGTH_STEP_EFFECT, change, None, switch="spectral_step", reason=nm, choice=chosen
     )
 
 
-def further_bounces_effect(bounces: Effect, bounce_fraction: float) -> Effect:
-    """Return the effect of bounces after the last summed one.
-
-    ``bounce_fraction`` is the fraction of light per further bounce.
-    """
-    if not bounces.is_built:
-        return Effect(
-            FURTHER_BOUNCES_EFFECT, "negligible", "interreflection is absent", 0.0, "last_bounce"
-        )
-    over_noise = float(bounces.over_noise or 0.0)
-    last = choose_min_bounce_fraction(over_noise)
-    because = f"the sum ends at {last:.1g} of the first"
-    left = over_noise * last / (1.0 - bounce_fraction)
-    return decide_effect(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", reason=because)
+def _further_bounces_effect(found: SampledBounces) -> Effect:
+    """Return the effect of bounces after the last summed one, and where the sum ends."""
+    exact = found.arriving(spectral=False, last=EXACT_BOUNCE_FRACTION)
+    for last in BOUNCE_CANDIDATES:
+        left = BOUNCE_MARGIN * found.over_noise(exact, found.arriving(spectral=False, last=last))
+        if left < MAX_REMAINING_NOISE_RATIO:
+            break
+    return decide_effect(
+        FURTHER_BOUNCES_EFFECT,
+        left,
+        None,
+        switch="last_bounce",
+        reason=f"the sum ends at {last:.1g} of the first",
+        choice=last,
+    )
 
 
 def target_interreflection_size(scenery: ViewingConditions) -> tuple[float, str]:
     """Return the size of interreflection within a target over noise, with its reason."""
-    if scenery.exchange_fraction == 0.0:
+    if scenery.exchange is None:
         return 0.0, "the target is flat"
     return math.inf, "the target has hollows"

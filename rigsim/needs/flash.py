@@ -1,11 +1,13 @@
 """Select the effects of light that the flash rig's images of a face or a target require."""
 
+import numpy as np
+
 from capture.rig import Rig
-from rigsim import shading
 from rigsim.arrays import FloatArray
 from rigsim.needs import face
-from rigsim.needs.effect_sizes import max_highlight, max_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, decide_effect, omitted_effects
+from rigsim.needs.effect_sizes import max_irradiance
+from rigsim.needs.effects import Effect, EffectSelection, NeedsError, decide_effect, omitted_effects
+from rigsim.needs.sampled_light import LitFace, SampledLight
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
@@ -16,7 +18,7 @@ def select_flash_effects(
     state: str,
     scenery: face.ViewingConditions,
     white_rgb: FloatArray,
-    weights_mm2: FloatArray,
+    light: SampledLight | None,
     movement: bool,
 ) -> EffectSelection:
     """Select the effects that a scene in the flash rig builds.
@@ -31,8 +33,8 @@ def select_flash_effects(
         Viewing conditions of a camera; for several see `rigsim.needs.effects.merge_selections`.
     white_rgb
         Signal of a white plate at the origin at the plan's highest power, full scales, shape (3,).
-    weights_mm2
-        Each light's energy over the total of such a plate, mm^2, shape (L,).
+    light
+        Direct light on a face, relative to that on such a plate, in one image; None for a target.
     movement
         Whether the face moves with its state.
     """
@@ -48,15 +50,16 @@ def select_flash_effects(
             )
         made.append(Effect(face.RELIEF_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
         return EffectSelection((*made, *omitted_effects("flash")))
+    if light is None:
+        raise NeedsError("light: got none, expected that on a face; sample it")
     skin = scenery.observe_skin(subject, state)
-    brightest = face.max_reflectance_rgb(skin)
-    places = [light.position_mm for light in rig.lights]
+    white = np.asarray(white_rgb, np.float64)
+    lit = LitFace.expose(skin, light, white)
+    places = np.array([lamp.position_mm for lamp in light.images[0]])
+    weights = [lamp.weight_mm2 for lamp in light.images[0]]
     # not clipped at full scale: the light of saturated pixels reaches others unclipped
-    level = max_irradiance(mesh, places, weights_mm2) * white_rgb * brightest
-    rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
-    shine = max_highlight(mesh, places, weights_mm2, view.position_mm, rough)
-    peak = float((level + white_rgb * shine).max())
-    made += face.select_face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
+    level = max_irradiance(mesh, places, weights) * white * lit.brightest
+    made += face.select_face_effects(lit, scenery, level=level, finer=True)
     made += _movement(subject, movement)
     return EffectSelection((*made, *omitted_effects("flash", "flash_face")))
 

@@ -91,6 +91,12 @@ class DefocusKernels:
         place = np.abs(self.defocus(toward_mm)) * ((DEPTH_SLICES - 1) / max(self.furthest, 1e-12))
         return np.asarray(np.clip(np.rint(place), 0, DEPTH_SLICES - 1), np.uint8)
 
+    def spilled_fraction(self, toward_mm: ArrayLike) -> Float64Array:
+        """Return the fraction of a pixel's light on other pixels by depth, same shape."""
+        # the weights of a sample's own pixel sum to the fraction that it keeps
+        kept = self.table[:, self.table.shape[1] // 2].sum(axis=1, dtype=np.float64)
+        return 1.0 - kept[self.slices(toward_mm)]
+
     def max_spilled_fraction(self, toward_mm: ArrayLike) -> float:
         """Return the largest fraction of a pixel's light on other pixels over some depths.
 
@@ -99,10 +105,7 @@ class DefocusKernels:
         toward_mm
             Depths before the plane in focus, mm, any shape.
         """
-        own = self.table.shape[1] // 2
-        rows = np.unique(self.slices(toward_mm))
-        # the weights of a sample's own pixel sum to the fraction that it keeps
-        return float(1.0 - self.table[rows, own].sum(axis=1).min())
+        return float(self.spilled_fraction(toward_mm).max())
 
 
 def tabulate_defocus(

@@ -1,9 +1,12 @@
 """Trace a camera's rays on a mesh, and the visible fraction of a light from its points."""
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
@@ -199,6 +202,7 @@ def visibility(
     *,
     radius_mm: float = 0.0,
     samples: int = 1,
+    chosen: BoolArray | None = None,
 ) -> Float32Array:
     """Return the fraction of a round light that is visible from each surface point.
 
@@ -217,6 +221,8 @@ def visibility(
     samples
         Points on the disc; the same golden spiral for every surface point, rotated by an angle
         that depends on the point's index only.
+    chosen
+        Points that are evaluated, shape (...); the others get 0. None: all.
 
     Returns
     -------
@@ -233,6 +239,8 @@ def visibility(
     seen = np.zeros(len(points), np.float32)
     toward = light - points
     reach = np.einsum("ij,ij->i", toward, normals) > -radius_mm
+    if chosen is not None:
+        reach &= chosen.reshape(-1)
     index = np.flatnonzero(reach)
     axis = light / max(float(np.linalg.norm(light)), 1e-6)
     helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
@@ -255,3 +263,57 @@ def visibility(
         free = ~caster.is_blocked(start[ray], way[ray], length[ray] * np.float32(0.999))
         seen[index[ray]] += free
     return (seen / np.float32(samples)).reshape(leading)
+
+
+COARSE_STEP: Final = 4
+"""Texels between those that choose where shadows need rays."""
+
+
+def texture_visibility(
+    caster: Caster,
+    position_mm: Float32Array,
+    normal: Float32Array,
+    light_mm: ArrayLike,
+    *,
+    radius_mm: float = 0.0,
+    samples: int = 1,
+) -> Float32Array:
+    """Return `visibility` on a texture; only texels near the edges of shadows get rays.
+
+    Every `COARSE_STEP`-th texel along both axes is traced. Where a coarse texel and its eight
+    neighbors have all light, or none, the texels around it have the same. Others are traced.
+
+    Parameters
+    ----------
+    caster, light_mm, radius_mm, samples
+        As for `visibility`.
+    position_mm, normal
+        Surface points and unit normals, shape (N, N, 3).
+    """
+    shape = position_mm.shape[:2]
+    cast = partial(
+        visibility, caster, position_mm, normal, light_mm, radius_mm=radius_mm, samples=samples
+    )
+    if min(shape) < MIN_COARSE_SIZE:
+        return cast()
+    nodes = [np.arange(0, n + COARSE_STEP - 1, COARSE_STEP).clip(max=n - 1) for n in shape]
+    on_node = np.zeros(shape, np.bool_)
+    on_node[np.ix_(*nodes)] = True
+    seen = cast(chosen=on_node)
+    coarse = seen[np.ix_(*nodes)]
+    low, high = minimum_filter(coarse, size=3), maximum_filter(coarse, size=3)
+    nearest = np.ix_(
+        *(
+            np.minimum((np.arange(n) + COARSE_STEP // 2) // COARSE_STEP, len(k) - 1)
+            for n, k in zip(shape, nodes, strict=True)
+        )
+    )
+    mixed = (low < high) | ((low > 0.0) & (high < 1.0))
+    edge = mixed[nearest] & ~on_node
+    out = np.where(on_node | edge, seen, low[nearest])
+    out[edge] = cast(chosen=edge)[edge]
+    return np.asarray(out, np.float32)
+
+
+MIN_COARSE_SIZE: Final = 128
+"""Texels along a texture's side from which on coarse texels choose the traced ones."""

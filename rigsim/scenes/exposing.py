@@ -7,8 +7,9 @@ import numpy as np
 
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, UInt16Array
+from rigsim.light.interreflection import DEFAULT_MIN_BOUNCE_FRACTION, Interreflection
 from rigsim.needs.effects import EffectSelection, PixelNoise, SceneEffects
-from rigsim.needs.face import INTERREFLECTION_EFFECT, ViewingConditions, choose_min_bounce_fraction
+from rigsim.needs.face import FURTHER_BOUNCES_EFFECT, ViewingConditions
 from rigsim.render import Caster
 from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.subject import SimulatedSubject
@@ -186,17 +187,17 @@ class FaceScene(RigScene):
         self,
         view: View,
         caster: Caster,
-        exchange_fraction: float,
+        exchange: Interreflection | None,
         noise: PixelNoise,
         effects: SceneEffects,
     ) -> ViewingConditions:
         """Return the viewing conditions of a camera."""
         return ViewingConditions(
-            view, self._illuminant, caster, exchange_fraction, noise, effects, self.subpixels
+            view, self._illuminant, caster, exchange, noise, effects, self.subpixels
         )
 
     def _last_bounce(self, effects: SceneEffects) -> float:
         """Return the fraction of the first bounce below which further bounces are omitted."""
         if effects.last_bounce is not None:
             return effects.last_bounce
-        return choose_min_bounce_fraction(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
+        return self.needs[FURTHER_BOUNCES_EFFECT].choice or DEFAULT_MIN_BOUNCE_FRACTION

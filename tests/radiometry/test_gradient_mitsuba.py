@@ -222,3 +222,18 @@ def test_coated_skin_agrees_with_olat(choice):
     np.testing.assert_array_equal(moments[..., 6], 0.5 * moments[..., 0])
     assert (moments[..., 0] > 0.3 * expected.mean(axis=-1)).any()
     assert not moments[..., 3].any()
+
+
+def test_skipped_shadow_rays_change_no_pixel(monkeypatch):
+    """Skin whose grooves hide LEDs: most rays are skipped, and no image changes."""
+    skin = plain_skin(WIDTH * 0.006 + 0.9)
+    scene = plain_scene(skin, width_px=WIDTH, renderer="mitsuba")
+    surface = scene.surface(NEUTRAL_GRIP, border_px=40)
+    direct, pitch_um = scene.lighting().direct, scene.lens.pixel_on_subject_um
+    fewer = direct.packed(surface, margin=40, pitch_um=pitch_um)
+    hidable = direct._hidable(surface, direct.leds, 40, pitch_um)
+    kept = np.mean([hidable(k).mean() for k in range(len(direct.leds))])
+    assert 0.05 < kept < 0.6
+    monkeypatch.setattr(TracedLight, "_hidable", lambda *_: None)
+    every = direct.packed(surface, margin=40, pitch_um=pitch_um)
+    assert np.abs(fewer - every).max() <= 1e-6 * np.abs(every).max()

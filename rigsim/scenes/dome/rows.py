@@ -193,6 +193,7 @@ class DomeSubsurfaceRadiance:
         self._kept: LruCache[tuple[str, int, float], tuple[np.float32, Float16Array]] = LruCache(
             lambda glow: SUBSURFACE_CACHE_BYTES // glow[1].nbytes
         )
+        self._latest: tuple[tuple[str, int, float], Float32Array] | None = None
 
     def on_rows(self, hits: Hits, lamp: Lamp, view: View, light: int, t_s: float) -> Float32Array:
         """Return the subsurface light at a camera's rows.
@@ -220,9 +221,13 @@ class DomeSubsurfaceRadiance:
             unit = np.float32(max(float(glow.max()), 1e-30) / FLOAT16_SCALE)
             return unit, np.asarray(glow / unit, np.float16)
 
-        unit, kept = self._kept.get((camera, light, t_s), lit)
+        key = camera, light, t_s
+        if self._latest is None or self._latest[0] != key:
+            unit, kept = self._kept.get(key, lit)
+            # all cameras request the same light in turn
+            self._latest = key, unit * kept.astype(np.float32)
         uv = hits.texture_uv()
-        return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))
+        return sample(self._latest[1], uv, np.ones(len(uv), np.bool_))
 
 
 def observe_face(

@@ -43,8 +43,8 @@ from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.mitsuba.image_hits import AddedLight
 from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
-from rigsim.needs.dome import min_noise, select_dome_effects
-from rigsim.needs.effect_sizes import max_exchange_fraction
+from rigsim.needs.dome import min_noise, sample_led_light, select_dome_effects
+from rigsim.needs.effect_sizes import coarse_exchange
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
@@ -134,10 +134,12 @@ class DomeScene(FaceScene):
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
         noise = min_noise([PixelNoise.of(sensor) for sensor in self._sensors.values()])
-        share = max_exchange_fraction(self._caster)
-        scenery = self._scenery(rig.views[0], self._caster, share, noise, effects)
+        exchange = coarse_exchange(self._caster)
+        scenery = self._scenery(rig.views[0], self._caster, exchange, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
-        self.needs = select_dome_effects(rig, self.subject, state, scenery, white, movement, motion)
+        light = sample_led_light(rig, self.subject, self._caster)
+        seen = (scenery, white, light, movement, motion)
+        self.needs = select_dome_effects(rig, self.subject, state, *seen)
         self.subject = select_face_tissue(self.subject, self.needs)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)

@@ -157,7 +157,9 @@ class FlashCamera:
         camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
         skin = ObservedSkin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
-        blurred = scatter_through_pigment(skin, glow.reflectance, even, glow.kernels)
+        if glow.pigment is None:
+            raise ValueError("glow: got one without lateral scattering, expected one with it")
+        blurred = scatter_through_pigment(skin, glow.pigment, even, glow.kernels)
         melanin, blood = skin.fractions_of(blurred)
         return {
             "reflectance_blurred": blurred,

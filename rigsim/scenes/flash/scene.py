@@ -11,7 +11,7 @@ parallel as behind crossed polarizers, for every subject.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,9 @@ FLAT_FIELD_LEVEL: Final = 0.9
 
 POP_ENERGY_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy between pops."""
+
+
+FlashTruth: TypeAlias = dict[str, NDArray[np.generic]]
 
 
 class FlashScene(FaceScene):
@@ -140,10 +143,15 @@ class FlashScene(FaceScene):
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
-        noise, share = PixelNoise.of(self._sensors[view.name]), self._stage.exchange_fraction
-        scenery = self._scenery(view, self._caster, share, noise, self._effects)
+        noise, exchange = PixelNoise.of(self._sensors[view.name]), self._stage.coarse_exchange
+        scenery = self._scenery(view, self._caster, exchange, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
-        seen = (scenery, white, self._flashes.weights, self.movement)
+        seen = (
+            scenery,
+            white,
+            self._stage.sample_light(self.subject, self._flashes, view),
+            self.movement,
+        )
         return select_flash_effects(self.rig, self.subject, self.state, *seen)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
@@ -330,8 +338,9 @@ class FlashScene(FaceScene):
 
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
-        glow = self._skin_glow(self._camera(view_name).spectral_sensitivity)
-        return edge_width_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
+        camera = self._camera(view_name).spectral_sensitivity
+        skin = ObservedSkin(self._face("skin"), self.state, camera, self._illuminant)
+        return edge_width_mm((kernels := skin.lateral_kernels()).sigmas_mm, kernels.weights)
 
     def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
         """Apply the analyzer to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
@@ -360,11 +369,9 @@ class FlashScene(FaceScene):
     def _bounces(self, skin: ObservedSkin) -> InterreflectionSettings | None:
         if not self.interreflections:
             return None
-        step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
-        if step is None:
-            step, _ = face_needs.choose_spectral_step(
-                skin, self.needs[face_needs.INTERREFLECTION_EFFECT]
-            )
+        spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
+        chosen = int(self.needs[face_needs.WAVELENGTH_STEP_EFFECT].choice or 1)
+        step = self._effects.spectral_step or chosen
         return InterreflectionSettings(
             self._stage.exchange, spectral, step, self._last_bounce(self._effects)
         )
@@ -399,13 +406,9 @@ class FlashScene(FaceScene):
         glow = self._skin_glow(view.spectral_sensitivity)
         return look.blurred_maps(self._face(), self.state, glow)
 
-    def _fractions_at_rest(
-        self, view: View, moved: dict[str, NDArray[np.generic]]
-    ) -> dict[str, NDArray[np.generic]]:
+    def _fractions_at_rest(self, view: View, moved: FlashTruth) -> FlashTruth:
         """Return the fractions of this state mapped onto the face at rest."""
-        face = self._face()
-        rest = face.rest
-        if rest is None:
+        if (rest := (face := self._face()).rest) is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
         spread = self._blurred_textures(view) if self.lateral else None
         look = self._flash_camera(view, rest.mesh)
@@ -416,10 +419,8 @@ class FlashScene(FaceScene):
     def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
-            depths = depth_range(view, mesh)
-            spread = tabulate_defocus(
-                view, self._illuminant, subpixels=self.subpixels, depths_mm=depths
-            )
+            how = {"subpixels": self.subpixels, "depths_mm": depth_range(view, mesh)}
+            spread = tabulate_defocus(view, self._illuminant, **how)
         return FlashCamera(self.rig, view, self.subpixels, spread)
 
     @cached_method

@@ -3,12 +3,17 @@
 from functools import cached_property
 from weakref import WeakValueDictionary
 
+import numpy as np
+
+from capture.rig import View
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.light.subsurface_radiance import SurfaceIllumination
 from rigsim.mitsuba.variant import VariantChoice
-from rigsim.needs.effect_sizes import max_exchange_fraction
+from rigsim.needs.effect_sizes import coarse_exchange
+from rigsim.needs.sampled_light import SampledLamp, SampledLight, sample_light
 from rigsim.render import Caster
+from rigsim.scenes.flash.surfaces import FlashLights
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
@@ -27,11 +32,28 @@ class FlashGeometry:
     def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
         self.held, self.caster = held, caster
         self.light: dict[object, SurfaceIllumination] = {}  # on the face, by its source
+        self.sampled: dict[object, SampledLight] = {}  # the same for rules, by source and camera
 
     @cached_property
-    def exchange_fraction(self) -> float:
-        """`max_exchange_fraction` of the mesh."""
-        return max_exchange_fraction(self.caster)
+    def coarse_exchange(self) -> Interreflection | None:
+        """`rigsim.needs.effect_sizes.coarse_exchange` of the mesh."""
+        return coarse_exchange(self.caster)
+
+    def sample_light(
+        self, subject: SimulatedSubject | Target, flashes: FlashLights, view: View
+    ) -> SampledLight | None:
+        """Return the light of all flashes on a face, for rules; None for a target."""
+        if not isinstance(subject, SimulatedSubject):
+            return None
+        key = (*flashes.key, view.position_mm)
+        if key not in self.sampled:
+            lamps = [
+                SampledLamp(light.position_mm, light.radius_mm, float(weight))
+                for light, weight in zip(flashes.lights, flashes.weights, strict=True)
+            ]
+            cameras = np.array([view.position_mm])
+            self.sampled[key] = sample_light(subject, self.caster, [lamps], cameras)
+        return self.sampled[key]
 
     @cached_property
     def exchange(self) -> Interreflection:

@@ -1,18 +1,21 @@
 """Render the light on a patch of skin by a Mitsuba scene: relief, skin, LEDs and camera."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from capture.rig import View
 from rigsim import shading
-from rigsim.arrays import Float32Array, Int32Array
+from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.as_built.sphere import REFERENCE_DISTANCE_MM, ActualSphere
 from rigsim.geometry.mesh import grid_faces
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.lobe_moments import MicrofacetSurface
+from rigsim.light.relief_shadow import horizon_tangent
 from rigsim.light.skin_material import describe_texture
 from rigsim.mitsuba.led_array import led_table
 from rigsim.mitsuba.rig_camera import describe_camera
@@ -24,6 +27,15 @@ from rigsim.tissue.skin_layers import ETA
 
 RAY_OFFSET_MM: Final = 1e-4
 """Start of shadow rays above the relief: 1 % of a sample's pitch, 800 float32 steps at 1 mm."""
+
+HORIZON_SLACK_RAD: Final = 0.03
+"""Elevation below which a horizon near an LED counts as able to hide it."""
+
+HORIZON_SECTORS: Final = 16
+"""Number of directions with horizons that choose the shadow rays."""
+
+HORIZON_WINDOW: Final = 5
+"""Samples around one whose highest horizon counts."""
 
 CORNER_OFFSET: Final = 0.001
 """Shift of the camera to the right and down, in samples: about 1 % of rays that aim at a corner of
@@ -88,8 +100,39 @@ class TracedLight:
                 "subpixels": 1,
             },
         )
-        image = integrator.image(scene, camera)
+        hidable = self._hidable(wide, lit, margin, pitch_um) if self.shadows else None
+        image = integrator.image(scene, camera, hidable)
         return np.ascontiguousarray(np.moveaxis(image, -1, 0))
+
+    def _hidable(
+        self, wide: PatchSurface, lit: Sequence[int], margin: int, pitch_um: float
+    ) -> Callable[[int], BoolArray]:
+        """Return a function of an index into ``lit``: samples at which the relief may hide its LED.
+
+        There the horizon is as high as the LED. The slack of its elevation is that of the LED's
+        disc, of positions in the field and of the triangles between samples.
+        """
+        height_um = wide.relief_um + wide.bulge_um
+        inner = slice(margin, -margin or None)
+        tangents = []
+        for k in range(HORIZON_SECTORS):
+            azimuth = 2.0 * math.pi * k / HORIZON_SECTORS
+            tangent = horizon_tangent(height_um, pixel_um=pitch_um, azimuth_rad=azimuth)
+            tangents.append(maximum_filter(tangent, size=HORIZON_WINDOW)[inner, inner])
+        field_mm = float(np.hypot(wide.x_mm, wide.y_mm).max())
+
+        def is_hidable(k: int) -> BoolArray:
+            led = lit[k]
+            place = self.sphere.position_mm[led]
+            distance_mm = float(np.linalg.norm(place))
+            reach_mm = field_mm + float(self.sphere.radius_mm[led])
+            lowest = math.asin(place[2] / distance_mm) - reach_mm / distance_mm - HORIZON_SLACK_RAD
+            turn = math.atan2(place[1], place[0]) / (2.0 * math.pi) * HORIZON_SECTORS
+            sector = math.floor(turn) % HORIZON_SECTORS
+            near = np.maximum(tangents[sector], tangents[(sector + 1) % HORIZON_SECTORS])
+            return np.asarray(near > math.tan(lowest))
+
+        return is_hidable
 
     def led_rows(self, lit: Sequence[int]) -> Float32Array:
         """Return the rows of some LEDs for `rigsim.mitsuba.led_array`, shape (N, 16)."""

@@ -70,8 +70,10 @@ IMAGE_CACHE_BYTES: Final = 2**29
 MAX_CACHED_LIGHTINGS: Final = 2
 """Number of cached lightings: LEDs may change by gains and failures."""
 
-MAX_CACHED_RELIEFS: Final = 4
-"""Number of cached stretched patches."""
+MIN_CACHED_RELIEFS: Final = 4
+RELIEF_CACHE_BYTES: Final = 2**28
+RELIEF_LAYERS: Final = 10
+"""Cached stretched patches: at least so many, up to a size; layers of four bytes in each."""
 
 
 class GradientScene(RigScene):
@@ -149,7 +151,9 @@ class GradientScene(RigScene):
             lambda picture: IMAGE_CACHE_BYTES // picture.nbytes
         )
         self._reliefs: LruCache[tuple[float, float], StretchedSkin] = LruCache(
-            lambda _: MAX_CACHED_RELIEFS
+            lambda relief: max(
+                MIN_CACHED_RELIEFS, RELIEF_CACHE_BYTES // (RELIEF_LAYERS * relief.height_um.nbytes)
+            )
         )
         self._analyzer = GridAnalyzer(self.films, self._view)
         level = math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s

@@ -1,6 +1,7 @@
 """Benchmark of effects that scenes omit: change of pixels over noise, and saved time."""
 
 import dataclasses
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -10,8 +11,8 @@ import numpy as np
 
 from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_tissue
-from rigsim.needs.effects import SceneEffects
-from rigsim.needs.face import LATERAL_EFFECT
+from rigsim.needs.effects import NEGLIGIBLE_NOISE_RATIO, SceneEffects
+from rigsim.needs.face import LATERAL_EFFECT, RELIEF_SHADOW_EFFECT
 from rigsim.needs.probe import (
     COLOR_EFFECT,
     CROSSTALK_EFFECT,
@@ -26,7 +27,7 @@ from rigsim.world.suction import HeadState
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
-from skinrig.benchmarks.simulation import omission_cases, tissue_omissions
+from skinrig.benchmarks.simulation import drawn_scenes, omission_cases, tissue_omissions
 from skinrig.benchmarks.simulation.omission_cases import (
     FLOAT32_ROUNDING,
     ComparedScene,
@@ -47,6 +48,8 @@ PROBE_SITE = "cheek"
 PRESET_NAMES = ("I", "II", "III", "IV", "V", "VI")
 N_PEOPLE = 20
 N_TOY_PEOPLE = 1
+FIRST_DRAWN_SEED = 100
+"""Scenes of lower seeds set the rules' factors."""
 TOY_PHOTONS = 20_000
 
 
@@ -70,6 +73,8 @@ def measure_omissions(stage: BenchmarkStage) -> None:
             stage.limits["change", one.rig, one.subject, one.effect] = one.max_change
     for rig in tissue_omissions.RIG_NAMES:
         _add_tissue(stage, rig)
+    for rig in ("flash",) if stage.toy else drawn_scenes.RIG_NAMES:
+        _add_drawn(stage, rig)
     built = [one for one in found if one.verdict == "built"]
     predicted = [
         one
@@ -99,6 +104,34 @@ def _add_tissue(stage: BenchmarkStage, rig: str) -> None:
     change = max(one.change for one in found)
     stage.add(knobs, timing, ErrorEstimate.nonnegative(change, 0.0), also)
     stage.limits["growth", rig, count] = growth
+
+
+def _add_drawn(stage: BenchmarkStage, rig: str) -> None:
+    """Add the effects of drawn scenes: predicted over found, and the omitted ones' changes."""
+    count = N_TOY_PEOPLE if stage.toy else N_PEOPLE
+    begun_s = time.process_time()
+    found: dict[str, list[drawn_scenes.DrawnEffect]] = {}
+    for number in range(count):
+        for effect in drawn_scenes.compare_drawn(rig, FIRST_DRAWN_SEED + number):
+            found.setdefault(effect.name, []).append(effect)
+    seconds = (time.process_time() - begun_s) / max(len(found), 1)
+    for name, effects in found.items():
+        visible = [one for one in effects if one.found >= NEGLIGIBLE_NOISE_RATIO]
+        ratios = [one.predicted / one.found for one in visible]
+        omitted = [one for one in effects if one.verdict == "negligible"]
+        knobs: Knobs = {"rig": rig, "subject": f"{count} drawn scenes"}
+        knobs |= {"effect": name, "verdict": "by the rules"}
+        also: Knobs = {"visible": len(visible), "omitted": len(omitted)}
+        if ratios:
+            least, median, high, most = np.quantile(ratios, (0.0, 0.5, 0.9, 1.0))
+            also |= {"predicted over found, least": float(least), "median": float(median)}
+            also |= {"9 of 10": float(high), "largest": float(most)}
+            if name != RELIEF_SHADOW_EFFECT:  # a few pixels decide it: the rule is a bound
+                stage.limits["tight", rig, name] = float(high)
+        change = max((one.found for one in omitted), default=0.0)
+        timing = Timing.single(seconds, no_memory_reason=NO_MEMORY_REASON)
+        stage.add(knobs, timing, ErrorEstimate.nonnegative(change, 0.0), also)
+        stage.limits["drawn", rig, name] = change
 
 
 def _changes_more_than_effect(comparison: EffectComparison) -> bool:

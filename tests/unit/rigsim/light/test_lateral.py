@@ -5,7 +5,7 @@ import pytest
 
 from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.lateral import LateralError, edge_width_mm, scatter_laterally
+from rigsim.light.lateral import HeatFlow, LateralError, edge_width_mm, scatter_laterally
 
 SIZE = 256
 
@@ -97,3 +97,22 @@ def test_gaussian_edge_width_is_2_56_sigma():
 def test_wrong_kernels_are_named(sigmas, weights, word):
     with pytest.raises(LateralError, match=word):
         scatter_laterally(point(), plate(10.0, 10.0), sigmas, weights)
+
+
+def test_minor_width_takes_fewer_steps_at_same_variance():
+    """A width of 1 % in each channel: its variance is exact for any number of steps."""
+    atlas = plate(64.0, 64.0)
+    flow = HeatFlow(atlas, [0.5, 3.0], [[0.99, 0.01]])
+    step = (np.arange(SIZE) - SIZE // 2) * 64.0 / SIZE
+    profile = flow.scatter(point())[..., 0].sum(axis=0)
+    variance = float(np.sum(profile * step**2) / profile.sum())
+    assert variance == pytest.approx(0.99 * 0.5**2 + 0.01 * 3.0**2, rel=0.03)
+
+
+def test_one_flow_scatters_several_fields_alike():
+    atlas, rng = plate(64.0, 32.0), np.random.default_rng(4)
+    flow = HeatFlow(atlas, [0.5, 2.0], [[0.3, 0.7]])
+    for _ in range(2):
+        field = rng.uniform(0.0, 1.0, (SIZE, SIZE, 1)).astype(np.float32)
+        alone = scatter_laterally(field, atlas, [0.5, 2.0], [[0.3, 0.7]])
+        np.testing.assert_array_equal(flow.scatter(field), alone)
