@@ -9,12 +9,8 @@ import numpy as np
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.pipeline.gradient.stages import (
-    CUTOFF_UM,
-    HISTOGRAM_FILE,
-    KERNEL_FILE,
-    STRAIN_FILE,
-)
+from reconstruction.pipeline.gradient.patch_relief import CUTOFF_UM
+from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.evaluating.subsurface import parse_number, read_document

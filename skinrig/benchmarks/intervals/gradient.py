@@ -21,7 +21,8 @@ from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
 from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
+from reconstruction.pipeline.gradient.patch_relief import CUTOFF_UM
+from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import stretch_skin
