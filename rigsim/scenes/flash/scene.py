@@ -419,8 +419,8 @@ class FlashScene(FaceScene):
     def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
-            how = {"subpixels": self.subpixels, "depths_mm": depth_range(view, mesh)}
-            spread = tabulate_defocus(view, self._illuminant, **how)
+            depths, fine = depth_range(view, mesh), self.subpixels
+            spread = tabulate_defocus(view, self._illuminant, subpixels=fine, depths_mm=depths)
         return FlashCamera(self.rig, view, self.subpixels, spread)
 
     @cached_method
