@@ -30,6 +30,7 @@ NEED_NO_REPORT = {
     "reconstruction/diffuse_albedo/kernels.py": "a pixel's weights, with a fixed number of steps",
     "reconstruction/facial_color/shared_melanin_kernels.py": "a pixel's bracketed root",
     "reconstruction/gradient_normals/moment_kernels.py": "two rounds of noise, not a search",
+    "reconstruction/gradient_normals/occlusion.py": "three steps per pixel, more lower no error",
     "reconstruction/photometric_stereo/kernels.py": "a pixel's residual is in its error",
     "reconstruction/registration/strain.py": "a fixed number of rounds of tracking",
     "reconstruction/stack_diagnosis/moved_images.py": "a fixed number of steps, with its residual",

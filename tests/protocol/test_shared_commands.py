@@ -310,7 +310,7 @@ def test_sequence_is_armed_run_and_read(make_box):
     box = make_box(
         *(("SEQ:ARM 8", "1.5,0.2,0.3,0.4,0.5"), ("TRIG run", "run,1500000")),
         *(("SEQ:POS?", "RUN,3,8,run"), ("SEQ:POS?", "IDLE,-1,0,-")),
-        *(("SEQ:STEP? 3", "2500000"), ("SEQ:STEP? 4", "NONE")),
+        *(("SEQ:STEP? 3", "2500000"), ("SEQ:STEP? 4", "NONE"), ("LED:FAIL?", "1A")),
         driver=PlainLedBox,
     )
     load = box._arm_table(8)
@@ -320,7 +320,9 @@ def test_sequence_is_armed_run_and_read(make_box):
     running, idle = box.position(), box.position()
     assert (running.state, running.row, running.rows, running.token) == ("RUN", 3, 8, "run")
     assert (idle.state, idle.row, idle.rows, idle.token) == ("IDLE", -1, 0, "")
-    assert (box.step_time(3), box.step_time(4), box.lost_events) == (2.5, None, 3)
+    assert (box.step_time(3), box.step_time(4)) == (2.5, None)
+    box.find_failed_leds()
+    assert box.failed_leds == {1, 3, 4}
 
 
 def test_releases_are_heard_while_lease_is_renewed(make_box, monkeypatch):
