@@ -73,12 +73,14 @@ def correct_occlusion(
     Returns
     -------
     ndarray, shape (H, W, 3)
-        Light between walls is not included.
+        Light between walls is not included. A pixel that no light reaches keeps its normal.
 
     Raises
     ------
     GradientError
         Without a valid pixel, and for shapes and numbers out of range.
+    SphereLightsError
+        For a refractive index outside 1 to 4, and normals that are not finite.
 
     Examples
     --------
@@ -140,7 +142,7 @@ def _place(x, y, z):  # type: ignore[no-untyped-def]
     """Return the disc position of the normal that mirrors the view towards a vector."""
     size = math.sqrt(x * x + y * y + z * z)
     if size < 1e-300:
-        return 0.0, 0.0
+        return math.nan, math.nan
     x, y, z = x / size, y / size, z / size + 1.0
     size = max(math.sqrt(x * x + y * y + z * z), 1e-6)
     scale = math.sqrt(2.0 / (1.0 + z / size)) / size
@@ -226,6 +228,8 @@ def _solve(relief, places, steps, pixel_um, tables, alpha):  # type: ignore[no-u
             for _ in range(SOLVER_STEPS):
                 now_u, now_v = _observed(u, v, tables, horizon, alpha, True)
                 step_u, step_v = wanted_u - now_u, wanted_v - now_v
+                if math.isnan(step_u):  # no light is left
+                    break
                 u, v = u + step_u, v + step_v
                 size = math.sqrt(u * u + v * v)
                 if size > MAX_PLACE:

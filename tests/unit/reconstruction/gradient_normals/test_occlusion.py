@@ -156,6 +156,15 @@ def test_hole_neither_shadows_nor_changes():
     assert found[far] == pytest.approx(correct(relief, normals)[far], abs=2e-3)
 
 
+def test_pixel_without_light_keeps_its_normal():
+    pit = np.full((9, 9), 1e4)
+    pit[4, 4] = 0.0
+    tilted = np.broadcast_to([0.1, 0.0, math.sqrt(0.99)], (9, 9, 3))
+    lights = even_sphere()
+    low = SphereLights(lights.directions[np.abs(lights.directions[:, 2]) < 0.7])
+    assert correct(pit, tilted, lights=low)[4, 4] == pytest.approx(tilted[4, 4], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "settings"),
     [

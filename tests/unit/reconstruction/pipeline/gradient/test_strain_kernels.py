@@ -133,8 +133,8 @@ def test_variance_errors_include_detail_hidden_in_images(fitted):
             ("t", one.variance_y, one.stderr_y),
         ):
             assert row[f"variance_{axis}_stderr"] > HIDDEN_VARIANCE_RATIO * value
-            assert row[f"variance_{axis}_stderr"] ** 2 == pytest.approx(
-                scatter**2 + (HIDDEN_VARIANCE_RATIO * value) ** 2
+            assert row[f"variance_{axis}_stderr"] == pytest.approx(
+                UNRESOLVED_VARIANCE * math.hypot(scatter, HIDDEN_VARIANCE_RATIO * value)
             )
 
 
