@@ -47,6 +47,7 @@ FINE_EDGES_PER_MM: Final = (2.0, 4.0, 8.0, 16.0)
 """Octaves that set one gain of all finer waves; windows with cheap cuts are a little flat."""
 MIN_PIXELS_PER_WAVE: Final = 4.0
 FINE_WINDOWS_PER_SIDE: Final = 12
+MAX_MESOSCALE_TEXEL_UM: Final = 0.25 * SPLIT_UM
 FLAT_TAPER: Final = 0.25
 """Fraction of a window over which it fades, for the fine band, whose pixels count evenly."""
 ROWS_PER_BAND: Final = 512
@@ -118,7 +119,8 @@ def match_spectrum(
     height_um : (H, W) float32
         Heights, um; an array or a memory map. Written.
     patches : sequence of ((h, w), float)
-        Leveled patches, um, NaN: hole; and the side of their pixels, um.
+        Leveled patches, um, NaN: hole; and the side of their pixels, um. Narrow holes spread power:
+        0.2 mm wide, over 30 % of a patch, they lower the gain by 6 %.
     shares : sequence of float
         Mean square weight of each patch in the map; they are divided by their sum.
     pixel_um : float or (h, w)
@@ -150,9 +152,9 @@ def match_spectrum(
     empty = np.empty(0)
     if len(edges) < 2 or min(coarse.height_um.shape) * coarse.sizes_um.min() < side_um:
         return SpectrumMatch(empty, empty, empty, empty, 1.0)
-    known = [(np.nan_to_num(np.asarray(one, np.float64)), pixel) for one, pixel in patches]
+    measured = [(np.asarray(one, np.float64), pixel) for one, pixel in patches]
     weights /= weights.sum()
-    fine_gain = _fine_gain(height_um, known, weights, sizes_um, side_um)
+    fine_gain = _fine_gain(height_um, measured, weights, sizes_um, side_um)
     for top in range(0, len(height_um), ROWS_PER_BAND):
         height_um[top : top + ROWS_PER_BAND] *= np.float32(fine_gain)
     coarse.height_um[:] *= fine_gain
@@ -161,7 +163,7 @@ def match_spectrum(
     sides = [(count, texels * float(size)) for size, texels, count in counts]
     target = np.zeros(len(edges) - 1)
     for count, side in sides:
-        target += count * _target_density(known, weights, side, edges)
+        target += count * _target_density(measured, weights, side, edges)
     target /= max(sum(count for count, _ in sides), 1)
     gains = np.ones(len(target))
     change = np.zeros_like(coarse.height_um)
@@ -188,8 +190,8 @@ def add_mesoscale(
     height_um : (N, N) float32
         Relief, um; an array or a memory map. Written.
     mesoscale_um : (M, M)
-        Displacement of the mesoscale surface over the same texture, um, M <= N; texels of at most a
-        quarter of `SPLIT_UM`.
+        Displacement of the mesoscale surface over the same texture, um, M <= N; texels of at most
+        `MAX_MESOSCALE_TEXEL_UM`.
     valid : (M, M) bool
         Texels of the surface; others are filled with the nearest one.
     pixel_um : float or (h, w)
@@ -210,7 +212,7 @@ def add_mesoscale(
         check.numbers("pixel_um", pixel_um, (), ("h", "w"), interval="(0, inf)")
     )
     check.within("side of mesoscale_um", len(given), f"[1, {len(height_um)}]")
-    check.within("median of pixel_um", float(np.median(sizes_um)), f"(0, {0.25 * SPLIT_UM}]")
+    check.within("median of pixel_um", float(np.median(sizes_um)), f"(0, {MAX_MESOSCALE_TEXEL_UM}]")
     if not known.any():
         raise SynthesisError("mesoscale_um: got no valid texel, expected some")
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -422,13 +424,17 @@ def _band_density(
     """Return the power density of bands, um^4, mean over windows (n, side, side).
 
     ``taper`` is the fraction of a window's side over which it fades; ``blocks`` corrects for means
-    over blocks.
+    over blocks. Holes are NaN; power is divided by the squared taper over known pixels alone, since
+    a hole has none.
     """
+    known = np.isfinite(windows)
+    heights = np.where(known, windows, 0.0)
     side = windows.shape[1]
-    fade = np.outer(signal.windows.tukey(side, taper), signal.windows.tukey(side, taper))
-    level = windows - np.einsum("nij,ij->n", windows, fade)[:, None, None] / fade.sum()
-    power = np.mean(np.abs(np.fft.fft2(level * fade)) ** 2, axis=0)
-    power *= texel_um**2 / np.sum(fade**2)
+    fade = known * np.outer(signal.windows.tukey(side, taper), signal.windows.tukey(side, taper))
+    means = np.sum(heights * fade, axis=(1, 2)) / np.maximum(fade.sum(axis=(1, 2)), 1e-30)
+    level = heights - means[:, None, None]
+    power = np.sum(np.abs(np.fft.fft2(level * fade)) ** 2, axis=0)
+    power *= texel_um**2 / max(float(np.sum(fade**2)), 1e-30)
     per_texel = np.fft.fftfreq(side)
     if blocks:  # means over blocks weaken waves
         power /= np.maximum(np.outer(np.sinc(per_texel), np.sinc(per_texel)), 0.6) ** 2

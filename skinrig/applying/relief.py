@@ -12,9 +12,8 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from scipy import ndimage
 
-from model import store
 from model.displacement_synthesis import growth as displacement_synthesis
-from model.displacement_synthesis.sources import SynthesisError, level_patch
+from model.displacement_synthesis.sources import level_patch
 from model.displacement_synthesis.split import SpectrumMatch, add_mesoscale, match_spectrum
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
@@ -29,6 +28,7 @@ from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.chart_seams import join_charts
 from skinrig.applying.expression import AppliedExpression, ApplyError
+from skinrig.applying.mesoscale import read_mesoscale
 from skinrig.applying.microstructure import apply_microstructure, strain_image
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
@@ -231,6 +231,9 @@ class ReliefEvaluator:
                 "choose one with --relief-site"
             )
         rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
+        scan = None
+        if asked.mesoscale is not None:
+            scan = read_mesoscale(asked.mesoscale, _face(self.mesh), scale, asked.size_px)
         shape = f"{asked.size_px} x {asked.size_px}"
         neutral: Any = None
         if asked.exceeds_exr:
@@ -267,31 +270,13 @@ class ReliefEvaluator:
             self.progress("join charts of the texture")
             noise = _draw_noise(_rms(patches), asked.size_px, scale, rng=rng)
             join_charts(neutral, _face(self.mesh), noise)
-        if asked.mesoscale is not None:
+        if scan is not None:
             self.progress("add the mesoscale")
-            _add_mesoscale_map(neutral, asked.mesoscale, self.mesh, scale)
+            add_mesoscale(neutral, *scan, scale / len(scan[0]))
         if asked.exceeds_exr:
             neutral.flush()
             os.replace(growing, self.temporary_folder / "displacement_neutral.npy")
         return neutral, match
-
-
-def _add_mesoscale_map(
-    neutral_um: Any, path: Path, mesh: BlendShapeMesh, scale_um: Float64Array
-) -> None:
-    """Add the waves of a scan's displacement map that relief lacks, in place."""
-    given = np.load(path) if path.suffix == ".npy" else store.read_exr(path)
-    if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) > len(neutral_um):
-        shape = " x ".join(str(n) for n in given.shape)
-        raise ApplyError(
-            f"{path}: got a map of {shape}, expected a square one of one channel with at most "
-            f"{len(neutral_um)} pixels per side"
-        )
-    valid = unwrap(_face(mesh), len(given)).covered
-    try:
-        add_mesoscale(neutral_um, given, valid, scale_um / len(given))
-    except SynthesisError as error:
-        raise ApplyError(f"{path}: {error}; give a finer map") from error
 
 
 def _sha256(path: Path) -> str:

@@ -11,6 +11,10 @@ from skinrig.applying.expression import ApplyError, ExpressionRequest, apply_exp
 from skinrig.applying.relief import ReliefEvaluator, ReliefRequest
 
 MICRO = (dynamic.MICROSTRUCTURE,)
+NPY_HEADER = b"\x93NUMPY\x01\x00v\x00" + (
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': (150, 150), }".ljust(117) + b"\n"
+)
+"""Header of a file whose heights are missing."""
 
 
 def relief_map(seed, side=160, wave_px=1.5):
@@ -155,13 +159,35 @@ def test_mesoscale_keeps_its_long_waves(folder, sheet, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shape", "match"), [((150, 140), "150 x 140"), ((20, 20), "finer map"), ((900, 900), "600")]
+    ("values", "match"),
+    [
+        (np.zeros((150, 140)), "150 x 140"),
+        (np.zeros((20, 20)), "600 um, expected at most 250 um; give a finer map"),
+        (np.zeros((900, 900)), "600"),
+        (np.full((150, 150), np.nan), "no valid texel on the mesh, expected some; export"),
+        (np.zeros((150, 150), complex), "complex128, expected a .npy file"),
+        (np.array([[None]]), "empty, damaged or pickled file, expected"),
+        (b"", "an empty, damaged"),
+        (b"heights", "an empty, damaged"),
+        (b"PK\x03\x04", "an empty, damaged"),
+        (NPY_HEADER, "an empty, damaged"),
+        (NPY_HEADER.replace(b"}", b" "), "an empty, damaged"),
+        (None, "No such file"),
+    ],
 )
-def test_unusable_mesoscale_map_is_refused(folder, sheet, tmp_path, shape, match):
+def test_unusable_mesoscale_map_is_refused_before_growth(
+    folder, sheet, tmp_path, monkeypatch, values, match
+):
+    monkeypatch.setattr("model.displacement_synthesis.growth.grow", None)
     path = tmp_path / "scan.npy"
-    np.save(path, np.zeros(shape))
-    with pytest.raises(ApplyError, match=match):
+    if isinstance(values, bytes):
+        path.write_bytes(values)
+    elif values is not None:
+        np.save(path, values)
+    with pytest.raises(ApplyError, match=match) as caught:
         applied(folder, sheet, tmp_path / "no", {"drawn": 0.0}, size_px=600, mesoscale=path)
+    assert str(caught.value).startswith(f"{path}: got ")
+    assert ("finer map" in str(caught.value)) == (np.shape(values) == (20, 20))
 
 
 def test_mesoscale_needs_measured_patches(folder, sheet, tmp_path):
