@@ -350,6 +350,20 @@ def test_eye_state_is_cleared_by_subject_or_reset(bench, forget):
     assert bench.ask("SAFE:EYES?") == "OPEN"
 
 
+@pytest.mark.parametrize("change", ["SAFE:EYES OPEN", "DOSE:NEW p2"])
+def test_armed_table_ends_with_eye_statement(bench, change):
+    """Six flashes per second were allowed for the eyes of before."""
+    bench.ask("SYST:ARM")
+    bench.ask("SAFE:EYES CLOSED")
+    bench.load(rows_of([front(1)[0], behind(1)[0]] * 6, ms=40, level=300))
+    assert float(bench.ask("SEQ:ARM 12").split(",")[0]) >= 3.0
+    bench.ask(change)
+    assert bench.ask("SAFE:EYES?") == "OPEN"
+    assert not int(bench.ask("STAT?")) & 32
+    assert bench.code("TRIG r1") == Code.NOT_ARMED
+    assert bench.code("SEQ:ARM 12") == Code.FLICKER
+
+
 def test_eye_state_is_cleared_by_brown_out(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
