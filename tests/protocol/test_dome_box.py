@@ -415,7 +415,7 @@ def failed_in(bench):
     return {led for led in range(150) if int(mask, 16) >> led & 1}
 
 
-def test_dead_led_ends_sequence_and_stays_dark():
+def test_dead_led_ends_sequence_and_stays_dark(box_side):
     a, b, c = behind(3)
     bench = DOME.bench(led_dead=str(b))
     bench.ask("SYST:ARM")
@@ -428,6 +428,8 @@ def test_dead_led_ends_sequence_and_stays_dark():
     assert bench.ask("SEQ:POS?") == "STOP,0,3,r1"
     assert failed_in(bench) == {b}
     assert not bench.unit.lit
+    if box_side == "compiled":  # else an LED whose contact closes again would be lit without end
+        assert bench.unit.driven == set()
     bench.run(rows_of([a, b, c]), "r2")
     bench.wait(0.3)
     assert bench.ask("SEQ:POS?") == "DONE,2,3,r2"
