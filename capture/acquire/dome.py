@@ -21,7 +21,6 @@ from capture.acquire.outcome import (
 )
 from capture.acquire.stripes import prepare_scan
 from capture.acquire.table_run import TableRun, count_attempts
-from capture.devices.camera import Frame
 from capture.devices.dome import DomeBox, TableRow
 from capture.devices.led_box import Eyes, LedBox
 from capture.devices.port import CommandRefused
@@ -243,18 +242,22 @@ class _Sequences:
         for first in range(0, len(steps), at_once):
             last = min(first + at_once, len(steps))
             for number, frames in table.rows(first, last):
-                self._keep(steps[number], rows[number], frames, table.times_s[number], attempt)
+                dead = sorted(table.dead_leds & set(rows[number].leds))
+                light = self._journal_light(rows[number], dead)
+                run.commit_frames(
+                    steps[number],
+                    frames,
+                    light=light,
+                    tries=attempt,
+                    t_box_s=table.times_s[number],
+                    journal_entries=light,
+                )
                 kept.add(number)
             run.operator.progress(f"{last}/{len(steps)} rows of {len(names)} cameras kept")
         return [step for number, step in enumerate(steps) if number not in kept]
 
-    def _keep(
-        self, step: Step, row: LedRow, frames: Mapping[str, Frame], t_box_s: float, attempt: int
-    ) -> None:
-        run, failed = self._run, sorted(set(row.leds) & self._box.failed_leds)
-        light: dict[str, Value] = {"light": run.light_names(row.leds) or "none", "level": row.level}
-        if failed:
-            light["dead_lights"] = run.light_names(failed)
-        run.commit_frames(
-            step, frames, light=light, tries=attempt, t_box_s=t_box_s, journal_entries=light
-        )
+    def _journal_light(self, row: LedRow, dead: Sequence[int]) -> dict[str, Value]:
+        """Return the light of a row for the journal, with the LEDs of it that were dark."""
+        names = self._run.light_names
+        light: dict[str, Value] = {"light": names(row.leds) or "none", "level": row.level}
+        return light | ({"dead_lights": names(dead)} if dead else {})

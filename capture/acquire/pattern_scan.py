@@ -39,6 +39,8 @@ class StepFrames:
     """Number of attempts until all cameras had a frame."""
     token: str
     """Token of the scan."""
+    dead_leds: frozenset[int]
+    """Numbers of the LEDs that were dark."""
 
 
 def analyzer_reading_deg(step: Step) -> float:
@@ -92,7 +94,6 @@ class PatternScanner:
 
     def commit(self, taken: Sequence[StepFrames], actual: Mapping[str, Value]) -> None:
         """Commit the frames of a scan, with further journal entries."""
-        dead = self._run.light_names(sorted(self._sphere.failed_leds))
         for one in taken:
             step = one.step
             light: dict[str, Value] = {
@@ -100,8 +101,8 @@ class PatternScanner:
                 "level": float(step.settings["level"]),
                 "analyzer_deg": analyzer_reading_deg(step),
             }
-            if dead:
-                light["dead_lights"] = dead
+            if one.dead_leds:
+                light["dead_lights"] = self._run.light_names(sorted(one.dead_leds))
             noted = {"token": one.token, **light, **actual}
             self._run.commit_frames(
                 step,
@@ -168,7 +169,8 @@ class PatternScanner:
         taken = []
         for number, step in enumerate(steps):
             for row, frames in table.rows(number, number + 1):
-                taken.append(StepFrames(step, frames, table.times_s[row], attempt, token))
+                time_s, dead = table.times_s[row], table.dead_leds
+                taken.append(StepFrames(step, frames, time_s, attempt, token, dead))
             self._keep_alive()
         return taken, table.end()
 

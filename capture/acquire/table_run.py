@@ -229,6 +229,9 @@ class TableRun:
     ----------
     times_s : dict of int to float
         Time at which each row released the cameras, on the controller's clock.
+    dead_leds : frozenset of int
+        Numbers of the LEDs that were dark in these rows. A new failure ends the table, so that it
+        is in none of them; controllers of revisions before 1.3 continue, and theirs are included.
     """
 
     def __init__(
@@ -249,9 +252,11 @@ class TableRun:
             name: arm_camera(camera, len(steps), box.ping) for name, camera in self._cameras.items()
         }
         keep_alive()
+        before = box.find_failed_leds()
         began_s = box.trigger(token)
         self.times_s = self._listen(token, began_s, poll_s, keep_alive)
-        box.find_failed_leds()
+        after = box.find_failed_leds()
+        self.dead_leds = before if box.stops_at_failure else after
         self._streams = {
             name: FrameStream(
                 name,

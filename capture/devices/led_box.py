@@ -88,7 +88,7 @@ class LedBox(EyeSafetyBox):
     Attributes
     ----------
     failed_leds : set of int
-        Numbers of the LEDs that the controller has found to draw no current.
+        Numbers of the LEDs that the controller has found to draw no current, at any time.
     """
 
     def __init__(self, port: Port, *, serial: str = "") -> None:
@@ -175,16 +175,24 @@ class LedBox(EyeSafetyBox):
         """Return the energy that an LED has emitted to this subject, Ws."""
         return self._number(f"DOSE? {led}")
 
-    def find_failed_leds(self) -> None:
-        """Add the LEDs that draw no current to `failed_leds`.
+    @property
+    def stops_at_failure(self) -> bool:
+        """Whether a new dead LED ends a sequence, as from revision 1.3 on."""
+        return int(self.limits.get("protocol_minor", 0)) >= _FAILURES_MINOR
+
+    def find_failed_leds(self) -> frozenset[int]:
+        """Return the LEDs that are not driven, and add them to `failed_leds`.
 
         A bad line can lose the event of such an LED; this query is repeated until it is answered.
-        Controllers of revisions before 1.3 have the event alone.
+        The controller clears its list at a reset. Controllers of revisions before 1.3 have the
+        event alone: the result is `failed_leds`.
         """
-        if int(self.limits.get("protocol_minor", 0)) < _FAILURES_MINOR:
-            return
+        if not self.stops_at_failure:
+            return frozenset(self.failed_leds)
         mask = self._read("LED:FAIL?", lambda got: int(got, 16), "hexadecimal digits")
-        self.failed_leds.update(led for led in range(mask.bit_length()) if mask >> led & 1)
+        found = frozenset(led for led in range(mask.bit_length()) if mask >> led & 1)
+        self.failed_leds |= found
+        return found
 
     def new_subject(self, pseudonym: str) -> None:
         """Restart the dose counter and clear the state of the eyes."""

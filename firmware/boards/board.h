@@ -21,6 +21,8 @@ void board_release_cameras(uint32_t mask);            /* pulse the lines of the 
 
 /* Lights, and the one stage that a box turns. */
 bool board_set_led(uint16_t led, double level);       /* 0 to 1; false: it draws no current.
+                                                         At 0 the answer is always true;
+                                                         below 0: test, and do not drive it.
                                                          Modeling lamps are LED 0,
                                                          projectors their number. */
 bool board_pop(double power, uint16_t center_nm, uint16_t width_nm); /* false: did not ignite */

@@ -51,10 +51,10 @@ bool bank_has_tripped(void);
 double bank_dose_ws(uint16_t led);
 void bank_new_subject(void);
 us_t bank_deadline(void);
-bool bank_advance(void); /* false: a driver has tripped, LED:HOT was said */
+bool bank_advance(void); /* false: a driver has tripped, LED:HOT was sent */
 /* Put out what is due, while a long judgment lets no time pass for the core. */
 void bank_keep_ends(void);
-/* false: it is newly found to draw no current, LED:FAIL was said; it is not driven again */
+/* false: it is newly found to draw no current, LED:FAIL was sent; it is not driven again */
 bool bank_switch_on(uint16_t led, double level, us_t end);
 bool bank_has_failed(uint16_t led);
 void bank_forget_failed(void);

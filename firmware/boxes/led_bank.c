@@ -110,6 +110,7 @@ bool bank_switch_on(uint16_t led, double level, us_t end) {
   bank_switch_off(led);
   if (bank.failed[led]) return true;
   if (!board_set_led(led, level)) {
+    board_set_led(led, 0.0); /* its contact may close again */
     bank.failed[led] = true;
     put_int(event_start(P("LED:FAIL")), led);
     event_end();

@@ -442,5 +442,6 @@ COMMAND(do_dose_new) {
   TRY(refuse_running());
   bank_new_subject();
   unit.eyes = EYES_OPEN; /* the statement was of the previous subject */
+  unit.armed = false;    /* the table was judged with it */
   return CODE_OK;
 }

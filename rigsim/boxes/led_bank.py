@@ -147,12 +147,13 @@ class LedBank:
         self.switch_off(led, now)
         if led in self.failed:
             return True
+        if level <= 0.0:
+            return True  # a board measures no current without driving the LED
         if not self.draws_current(led, now):
             self.failed.add(led)
             return False
-        if level > 0.0:
-            self._heat_until(now)
-            self._lit[led] = (level, now, end_s)
+        self._heat_until(now)
+        self._lit[led] = (level, now, end_s)
         return True
 
     def switch_off(self, led: int, now: float) -> None:

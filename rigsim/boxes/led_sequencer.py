@@ -402,5 +402,6 @@ class LedSequencer(Device, Generic[RowT]):
         parse_token(arguments)
         self._require_still()
         self.bank.new_subject()
-        # the eye state was confirmed for the previous subject only
+        # the eye state was confirmed for the previous subject only; the table was judged with it
         self.eyes = "OPEN"
+        self._sequence_armed = False

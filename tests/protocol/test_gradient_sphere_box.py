@@ -384,6 +384,17 @@ def test_dead_led_ends_one_scan_weak_led_none():
     assert len(bench.world.switched) == 3
 
 
+def test_dead_led_at_level_zero_ends_no_scan():
+    """A board measures the current of LEDs that it drives."""
+    bench = GRADIENT_SPHERE.bench(led_dead="0")
+    for gain, state, failed in ((0, "DONE,1,2,r0", 0), (1000, "STOP,-1,2,r1000", 1)):
+        bench.ask(f"GAIN:DEF 0,{gain}")
+        bench.run(rows_of(["full", "full"]), f"r{gain}")
+        bench.wait(0.3)
+        assert bench.ask("SEQ:POS?") == state
+        assert int(bench.ask("LED:FAIL?"), 16) == failed
+
+
 def test_the_emergency_stop_is_reported_and_nothing_lights():
     bench = GRADIENT_SPHERE.bench(interlock=True)
     bench.ask("SYST:ARM")

@@ -321,11 +321,11 @@ def test_sequence_is_armed_run_and_read(make_box):
     assert (running.state, running.row, running.rows, running.token) == ("RUN", 3, 8, "run")
     assert (idle.state, idle.row, idle.rows, idle.token) == ("IDLE", -1, 0, "")
     assert (box.step_time(3), box.step_time(4)) == (2.5, None)
-    box.find_failed_leds()  # an older controller is not asked
-    assert box.failed_leds == set()
+    box.failed_leds.add(0)
+    assert box.find_failed_leds() == {0}  # an older controller is not asked
     box._limits = {**box.limits, "protocol_minor": 3}
-    box.find_failed_leds()
-    assert box.failed_leds == {1, 3, 4}
+    assert box.find_failed_leds() == {1, 3, 4}
+    assert box.failed_leds == {0, 1, 3, 4}
 
 
 def test_releases_are_heard_while_lease_is_renewed(make_box, monkeypatch):

@@ -47,6 +47,7 @@ class Witness:
             image[1, 1] = round(pop.analyzer_deg)
             image[1, 2] = round(1000 * pop.level)
             image[1, 3] = round(1e5 * (pop.t_off_s - pop.t_on_s))
+            image[1, 4] = pop.led_shares.count(0.0)
         image[2, 0] = 1000 + round(grip.angle_deg)
         image[2, 1] = 1000 + grip.step
         image[2, 2] = round(1000 * grip.stretch)
@@ -259,6 +260,21 @@ def test_targets_need_neither_caliper_nor_force(make, target):
     assert bench.asked == []
     assert len({r.actual["token"] for r in bench.session.frames()}) >= 1
     assert bench.at_rest
+
+
+@pytest.mark.parametrize(("minor", "lit_but_marked"), [(2, 2), (3, 0)])
+def test_frames_before_led_failure_are_not_marked(make, monkeypatch, minor, lit_but_marked):
+    """Older controllers may have continued at the failure: all frames of that scan are marked."""
+    bench = make(gradient_calibration_plan(RIG, "ball"), led_dead="11", led_dead_after=0.37)
+    monkeypatch.setitem(bench.sphere.limits, "protocol_minor", minor)
+    done = bench.run(eyes="open")
+    assert done.dead_lights == (RIG.lights[11].name,)
+    lit = [one for one in bench.session.frames() if one.settings["pattern"] != "dark"]
+    dark = {one.step_id for one in lit if bench.session.read(one).cfa[1, 4] == 1}
+    marked = {one.step_id for one in lit if "dead_lights" in one.actual}
+    assert (len(lit), len(dark)) == (10, 8)  # the third pattern of the first scan found it
+    assert dark <= marked
+    assert len(marked - dark) == lit_but_marked
 
 
 # how far skin goes ----------------------------------------------------------------------------
