@@ -144,7 +144,7 @@ class Session(SessionView):
             extra=dict(extra or {}),
         )
         make_folder(disk, place, manifest.encode()[0])
-        return cls.resume(place, disk=disk)
+        return cls._acquire(place, disk)
 
     @classmethod
     def open(cls, path: str | Path) -> Session:
@@ -176,7 +176,10 @@ class Session(SessionView):
         SessionDamage
             When manifest or journal differ from what was written, or a committed frame is missing.
         """
-        disk, place = disk or Disk(), Path(path)
+        return cls._acquire(Path(path), disk or Disk(), interrupted=True)
+
+    @classmethod
+    def _acquire(cls, place: Path, disk: Disk, *, interrupted: bool = False) -> Session:
         read_undamaged_contents(place)
         with DiskErrors(place):
             descriptor = disk.open_append(place / JOURNAL_FILE)
@@ -192,8 +195,11 @@ class Session(SessionView):
                 if contents.walk.torn:
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
-                # the last process may have ended before the disk confirmed its last line
+                # the last process may have ended before the disk confirmed its last line, or the
+                # names of the new session and of its folder
                 disk.fdatasync(descriptor)
+                for folder in (place, place.resolve().parent) if interrupted else ():
+                    disk.fsync_dir(folder)
                 move_orphans(disk, place, contents)
             except BaseException:
                 disk.close(descriptor)

@@ -42,8 +42,13 @@ def manifest_written(folder):
     ]
 
 
-def resumed(folder):
+def acquired(folder):
     return [f"{one} {folder}/journal.jsonl" for one in ("open_append", "lock", "fdatasync")]
+
+
+def resumed(folder):
+    """Operations that resume: the last process may have ended before its names were durable."""
+    return [*acquired(folder), f"fsync_dir {folder}", "fsync_dir ."]
 
 
 def line_written(folder):
@@ -56,7 +61,7 @@ def test_session_exists_once_its_parts_are_durable(tmp_path, disk):
         *(f"make_dir {folder}" for folder in ("s", "s/frames", "s/orphans")),
         *written("s/journal.jsonl"),
         *manifest_written("s"),
-        *resumed("s"),
+        *acquired("s"),
         "close s/journal.jsonl",
     ]
 
@@ -114,9 +119,9 @@ def test_resuming_cuts_line_then_moves_strays(tmp_path, disk):
     with (tmp_path / "s/journal.jsonl").open("ab") as journal:
         journal.write(b'{"h":"half')
     Session.resume(tmp_path / "s", disk=disk).release()
-    opened, locked, flushed = resumed("s")
+    opened, locked, *flushed = resumed("s")
     assert disk.take_notes() == [
-        *(opened, locked, "truncate s/journal.jsonl", flushed),
+        *(opened, locked, "truncate s/journal.jsonl", *flushed),
         *(f"rename s/orphans/{name}.1" for name in ("b.ply", "S000+cam.dng.part")),
         *(f"fsync_dir s/{folder}" for folder in ("orphans", "attachments", "frames")),
         "close s/journal.jsonl",
@@ -187,7 +192,7 @@ def test_leftovers_of_creation_are_removed_first(tmp_path, disk, key, monkeypatc
     assert disk.take_notes() == [
         *("remove s/consent.seal.part", "remove s/consent.seal", "remove s/session.json.part"),
         *manifest_written("s"),
-        *resumed("s"),
+        *acquired("s"),
         "close s/journal.jsonl",
     ]
 

@@ -426,7 +426,7 @@ class FullDisk(Disk):
 def test_failing_disk_costs_single_frame_not_acknowledged_ones(session, operation):
     commit(session, "D000")
     session.release()
-    resumed = int(operation == "fdatasync")  # the journal is synchronized first
+    resumed = {"fdatasync": 1, "fsync_dir": 2}.get(operation, 0)  # the session is made durable
     writer = Session.resume(session.path, disk=FullDisk(operation, after=resumed))
     with pytest.raises(SessionDiskError, match="No space left"):
         commit(writer, "S000")
@@ -525,7 +525,7 @@ def test_nothing_is_attached_to_a_closed_session(closed):
 def test_failing_disk_costs_attachment_only_keeps_acknowledged_data(session, operation):
     commit(session, "D000")
     session.release()
-    resumed = int(operation == "fdatasync")  # the journal is synchronized first
+    resumed = {"fdatasync": 1, "fsync_dir": 2}.get(operation, 0)  # the session is made durable
     writer = Session.resume(session.path, disk=FullDisk(operation, after=resumed))
     with pytest.raises(SessionDiskError, match="No space left"):
         writer.attach("scan.ply", b"scan")
