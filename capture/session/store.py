@@ -128,8 +128,7 @@ class Session(SessionView):
         SessionError
             When the folder is not empty, or a value cannot be written.
         """
-        disk = disk or Disk()
-        place = Path(path)
+        disk, place = disk or Disk(), Path(path)
         manifest = Manifest(
             id=session_id or uuid.uuid4().hex,
             created_at=(now or (lambda: datetime.now(UTC)))(),
@@ -195,8 +194,7 @@ class Session(SessionView):
                 if contents.walk.torn:
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
-                # the last process may have ended before the disk confirmed its last line, or the
-                # names of the new session and of its folder
+                # the last process may have ended before the disk confirmed line or folder
                 disk.fdatasync(descriptor)
                 for folder in (place, place.resolve().parent) if interrupted else ():
                     disk.fsync_dir(folder)
@@ -426,9 +424,7 @@ class Session(SessionView):
     def _writable(self) -> int:
         if self._descriptor is None:
             why = "closed" if self.closed else "not open for writing"
-            advice = (
-                "A closed session is never modified; open an unfinished one with Session.resume."
-            )
+            advice = "A closed session is never modified; Session.resume opens an unfinished one."
             raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
         return self._descriptor
 
@@ -444,9 +440,7 @@ class Session(SessionView):
         expected = done[-1].attempt + 1 if done else 1
         if attempt < 1 or (done and attempt != expected):
             faults = [Fault("attempt", str(attempt), f"{expected}")]
-            advice = (
-                "A committed frame is never replaced; take it again with the next attempt number."
-            )
+            advice = "A committed frame is never replaced; take it with the next attempt number."
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         check_blob(blob, step_id, self.id)
