@@ -385,7 +385,7 @@ def test_failing_close_is_over(monkeypatch, failure):
 
 
 def test_damaged_reply_to_hello_is_awaited(open_port):
-    """A line between, damaged, is no answer; the next attempt gets one."""
+    """The port ignores a damaged line; its next attempt is answered."""
     lost = greet(8)[1].replace(HELLO.encode(), b"1,flush")
     port = open_port((greet(8)[0], lost), greet(8))
     assert port.hello().kind == "flash"

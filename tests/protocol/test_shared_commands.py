@@ -329,7 +329,7 @@ def test_sequence_is_armed_run_and_read(make_box):
 
 
 def test_releases_are_heard_while_lease_is_renewed(make_box, monkeypatch):
-    """Rows and times in digits; anything else is no release."""
+    """An event releases a row if its row and time are digits."""
     payloads = ["0,1500000", "12,2000000", "x,5", "3,y", "4", "-1,7"]
     heard = [[wire.Event(n, 1, "SEQ:STEP", one) for n, one in enumerate(payloads)]]
     heard += [[], [wire.Event(9, 1, "SEQ:STOP", "5,6"), wire.Event(10, 1, "SEQ:STEP", "13,1")]]

@@ -254,7 +254,7 @@ def test_dim_flash_counts_from_tenth_of_brightest():
 
 
 def test_rms_has_no_rests():
-    """Steady light of 3 s: the dark before and after is no flicker of the plan."""
+    """Steady light of 3 s: the plan does not flicker, although dark precedes and follows it."""
     rows = [LedRow((0,), 0.5, 1.5), LedRow((0,), 0.5, 1.5)]
     report = flicker_of_rows(rows, np.array([4.0]))
     assert report.rms == pytest.approx(0.0, abs=1e-9)

@@ -92,8 +92,8 @@ def test_edge_light_loss_matches_lateral_scattering(texels):
     inside = atlas.covered & (x >= edge) & (x < edge + texels * texel_mm)
     inside &= np.abs(atlas.position_mm[..., 1] - 20.0) < 10.0
     lost = 1.0 - float(spread[inside].mean())
-    told = effect_sizes.edge_loss([0.8], [[1.0]], texels * texel_mm)[0]
-    assert lost == pytest.approx(told, rel=0.05)
+    predicted = effect_sizes.edge_loss([0.8], [[1.0]], texels * texel_mm)[0]
+    assert lost == pytest.approx(predicted, rel=0.05)
     assert lost != pytest.approx(effect_sizes.edge_loss([0.7], [[1.0]], 1.0)[0], rel=0.05)
 
 
@@ -122,8 +122,8 @@ def test_groove_occludes_sky_like_two_walls():
     normals[..., 0], normals[..., 2] = -slope / math.sqrt(2.0), 1.0 / math.sqrt(2.0)
     found = hidden_sky_fraction(height, normals, margin=0, pixel_um=1.0, sectors=64)
     d = np.arange(8, 60)
-    told = 0.5 * (1.0 - d / np.hypot(128.0, d))
-    np.testing.assert_allclose(found[512, 128 + d], told, rtol=0.06)
+    predicted = 0.5 * (1.0 - d / np.hypot(128.0, d))
+    np.testing.assert_allclose(found[512, 128 + d], predicted, rtol=0.06)
     assert (
         hidden_sky_fraction(
             np.zeros((4, 4), np.float32),
@@ -203,14 +203,14 @@ def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
         made = FlashScene(rig, face, power=power, effects=SceneEffects(**settings))
         return power * np.stack([made.radiance(name) for name in ("parallel", "crossed")])
 
-    told = {effect.switch: effect.over_noise for effect in scene.needs}
+    predicted = {effect.switch: effect.over_noise for effect in scene.needs}
     for switch in ("lateral", "interreflections", "spectral", "optics"):
         have, lack = light(**{switch: True}), light(**{switch: False})
         # what is full shows no change, but what it sends to others does
         change = np.abs(np.minimum(have, 1.0) - np.minimum(lack, 1.0)) / noise.sigma(have)
         # below a tenth of what may be omitted the factor is not a bound
-        assert change.max() <= max(told[switch], 0.1 * NEGLIGIBLE_NOISE_RATIO)
-    assert told["interreflections"] < 40.0 * max(told["spectral"], 0.02)
+        assert change.max() <= max(predicted[switch], 0.1 * NEGLIGIBLE_NOISE_RATIO)
+    assert predicted["interreflections"] < 40.0 * max(predicted["spectral"], 0.02)
 
 
 @pytest.mark.long
@@ -226,7 +226,7 @@ def test_sampled_highlights_reach_those_of_image(flash, faces):
 
 @pytest.mark.long
 def test_fewer_wavelengths_change_pixels_below_stated_bound(flash, faces):
-    """Of light from skin to skin, whose share is told as a bound, between any two of its skins."""
+    """Of light from skin to skin: its predicted share bounds that between any two skins."""
     face = faces["II"]
     scene = FlashScene(flash, face)
     noise = PixelNoise.of(scene.sensor())
