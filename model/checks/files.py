@@ -7,10 +7,11 @@ compared with the stored one, and pickled objects are never loaded.
 import io
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,11 @@ MAX_EXPANSION = 1100
 """Largest ratio of unpacked to packed bytes; that of deflate is 1032 (RFC 1951)."""
 READABLE_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes, and for which `MAX_EXPANSION` holds."""
+HEADER_ERRORS = (
+    *(MemoryError, OverflowError, SyntaxError, TypeError, KeyError, RuntimeError),
+    tokenize.TokenError,
+)
+"""What NumPy raises for a damaged header of an array, besides ValueError."""
 MIN_UNPACKED_BYTES = 2**20
 """Unpacked size that any file may have."""
 
@@ -126,32 +132,80 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
             return {
                 name: _read_array(found, entry) for name, entry in zip(names, entries, strict=True)
             }
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise ValueError(f"is not a readable archive: {error}") from error
-    except (MemoryError, OverflowError, SyntaxError, TypeError, KeyError) as error:
+    except HEADER_ERRORS as error:
         raise ValueError(f"has an unreadable array: {error!r}") from error
+
+
+def map_array(path: Path) -> NDArray[Any]:
+    """Map an .npy file into memory, read-only.
+
+    Raises
+    ------
+    ValueError
+        For another file, a damaged header, pickled objects, or a size that does not fit.
+    OSError
+        When the file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "heights.npy"
+    >>> np.save(path, np.zeros((2, 3), np.float32))
+    >>> map_array(path).shape
+    (2, 3)
+    """
+    stored_bytes = path.stat().st_size
+    try:
+        with path.open("rb") as stream:
+            header = _read_header(stream, path.name, stored_bytes)
+            offset = stream.tell()
+    except HEADER_ERRORS as error:
+        raise ValueError(f"has an unreadable header: {error!r}") from error
+    if header.stored_bytes != stored_bytes - offset:
+        raise ValueError(
+            f"got {stored_bytes - offset} bytes of values, expected {header.stored_bytes}"
+        )
+    if not header.stored_bytes:
+        return np.empty(header.shape, header.dtype)
+    order: Literal["C", "F"] = "F" if header.is_fortran else "C"
+    return np.memmap(path, header.dtype, "r", offset, header.shape, order)
+
+
+class _Header(NamedTuple):
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype[Any]
+
+    @property
+    def stored_bytes(self) -> int:
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _read_header(stream: IO[bytes], name: str, most_bytes: int) -> _Header:
+    """Read the header of one array, of which the file has at most some bytes."""
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        header = _Header(*np.lib.format.read_array_header_1_0(stream))
+    elif version == (2, 0):
+        header = _Header(*np.lib.format.read_array_header_2_0(stream))
+    else:
+        raise ValueError(f"{name}: got version {version}, expected 1.0 or 2.0")
+    if header.dtype.hasobject:
+        raise ValueError(f"{name}: contains pickled objects")
+    if any(length < 0 for length in header.shape):
+        raise ValueError(f"{name}: got shape {header.shape}")
+    if header.stored_bytes > most_bytes:
+        raise ValueError(f"{name}: declares {header.stored_bytes} bytes, its file has {most_bytes}")
+    return header
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
     with archive.open(entry) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-        elif version == (2, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
-        else:
-            raise ValueError(f"{entry.filename}: got version {version}, expected 1.0 or 2.0")
-        if dtype.hasobject:
-            raise ValueError(f"{entry.filename}: contains pickled objects")
-        if any(length < 0 for length in shape):
-            raise ValueError(f"{entry.filename}: got shape {shape}")
-        wanted = math.prod(shape) * dtype.itemsize
-        if wanted > entry.file_size:
-            raise ValueError(
-                f"{entry.filename}: declares {wanted} bytes, its file has {entry.file_size}"
-            )
+        header = _read_header(stream, entry.filename, entry.file_size)
         data = stream.read()
-    if len(data) != wanted:
-        raise ValueError(f"{entry.filename}: got {len(data)} bytes, expected {wanted}")
-    flat = np.frombuffer(data, dtype).copy()
-    return flat.reshape(shape, order="F" if fortran else "C")
+    if len(data) != header.stored_bytes:
+        raise ValueError(f"{entry.filename}: got {len(data)} bytes, expected {header.stored_bytes}")
+    flat = np.frombuffer(data, header.dtype).copy()
+    return flat.reshape(header.shape, order="F" if header.is_fortran else "C")

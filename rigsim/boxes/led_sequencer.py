@@ -390,6 +390,8 @@ class LedSequencer(Device, Generic[RowT]):
     def _set_eyes(self, arguments: str, now: float) -> None:
         self.eyes = parse_choice(arguments, EYE_STATES)
         self._sequence_armed = False
+        if self.eyes == "OPEN":  # what runs was judged for eyes that are not open
+            self.go_dark(now)
 
     def _list_failed(self, _: str, now: float) -> str:
         mask = sum(1 << led for led in self.bank.failed)

@@ -69,10 +69,15 @@ def npz(**arrays):
     return content.getvalue()
 
 
-def npz_of(header, body=b""):
-    """Return an archive whose array has a header of one's own."""
+def npy_of(header, body=b""):
+    """Return an array whose header is one's own."""
     text = header.encode().ljust(118) + b"\n"
-    data = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
+
+
+def npz_of(header, body=b""):
+    """Return an archive with such an array."""
+    data = npy_of(header, body)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("faces.npy", data)
@@ -111,6 +116,9 @@ PICKLE = b"cos\nsystem\n(S'false'\ntR."
 ATTACKS = {
     "npz declares terabytes": ("npz", lambda good: npz_of(HUGE)),
     "npz holds a pickle": ("npz", lambda good: npz_of(OBJECTS, PICKLE)),
+    "npy declares terabytes": ("npy", lambda good: npy_of(HUGE)),
+    "npy holds a pickle": ("npy", lambda good: npy_of(OBJECTS, PICKLE)),
+    "npz header is no text of Python": ("npz", lambda good: npz_of(HUGE.replace("}", "("))),
     "npz has a name twice": ("npz", lambda good: twice()),
     "npz negative shape": ("npz", lambda good: npz_of(HUGE.replace("109", "-109"))),
     "npz blend shapes pickle": ("npz blend shapes", lambda good: npz_of(OBJECTS, PICKLE)),

@@ -364,6 +364,21 @@ def test_armed_table_ends_with_eye_statement(bench, change):
     assert bench.code("SEQ:ARM 12") == Code.FLICKER
 
 
+def test_open_eyes_end_running_sequence(bench):
+    """What runs was allowed for closed eyes: six flashes per second would follow."""
+    bench.ask("SYST:ARM")
+    bench.ask("SAFE:EYES CLOSED")
+    bench.load(rows_of([front(1)[0], behind(1)[0]] * 6, ms=40, level=300))
+    bench.ask("SEQ:ARM 12")
+    bench.ask("TRIG r1")
+    bench.ask("SAFE:EYES SHIELDED")
+    bench.wait(0.1)
+    assert bench.ask("SEQ:POS?").startswith("RUN,")
+    bench.ask("SAFE:EYES OPEN")
+    assert bench.ask("LED?") == "-"
+    assert bench.ask("SEQ:POS?").startswith("STOP,")
+
+
 def test_eye_state_is_cleared_by_brown_out(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.checks.files import map_array
 from skinrig.atomic_file import replace_folder_atomically
 
 TILE_PX: Final = 256
@@ -146,12 +147,11 @@ def open_displacement(path: Path, folder: Path) -> Pyramid:
         If the file is of another type; see also `build`.
     """
     try:
-        source = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        source = map_array(path)
+    except ValueError as error:
         raise TileError(f"{path}: not a .npy file of heights ({error}); check the file") from error
-    if not isinstance(source, np.ndarray) or source.dtype.kind != "f":
-        kind = getattr(source, "dtype", type(source).__name__)
-        raise TileError(f"{path}: got {kind}, expected an array of float32 heights, um")
+    if source.dtype.kind != "f":
+        raise TileError(f"{path}: got {source.dtype}, expected an array of float32 heights, um")
     return build(source, folder)
 
 

@@ -66,9 +66,12 @@ def test_holes_are_refused_and_nothing_half_written_stays(tmp_path):
 
 def test_file_without_height_array_is_refused(tmp_path):
     other = tmp_path / "other.npy"
-    other.write_bytes(b"not an array")
-    with pytest.raises(TileError, match=r"not a \.npy file"):
-        tiles.open_displacement(other, tmp_path / "levels")
+    np.save(other, np.zeros((512, 512), np.float32))
+    good = other.read_bytes()
+    for damaged in (b"not an array", good[:5], good[:-1], good.replace(b"'descr'", b"0/-descr")):
+        other.write_bytes(damaged)
+        with pytest.raises(TileError, match=r"not a \.npy file"):
+            tiles.open_displacement(other, tmp_path / "levels")
     np.save(other, np.zeros((512, 512), np.int16))
     with pytest.raises(TileError, match="got int16"):
         tiles.open_displacement(other, tmp_path / "levels")
