@@ -69,13 +69,6 @@ class TraitLibrary:
         """Return all traits of all spaces in alphabetical order."""
         return tuple(sorted({name for space in self.spaces.values() for name in space.traits}))
 
-    def spaces_with(self, trait: str) -> dict[str, TraitSpace]:
-        """Return the spaces that have a trait; raise `TraitError` if none has."""
-        found = {name: space for name, space in self.spaces.items() if trait in space.traits}
-        if not found:
-            raise TraitError(f"trait: got {trait!r}, expected one of {', '.join(self.names)}")
-        return found
-
     def to_bytes(self, *, precision: Precision = "float32") -> bytes:
         """Return the library as one npz file.
 

@@ -90,11 +90,6 @@ def complete_stages(incomplete: str) -> list[str]:
     return filter_by_prefix(STAGES, incomplete)
 
 
-def complete_scales(incomplete: str) -> list[str]:
-    """Complete a scale of a simulation."""
-    return filter_by_prefix(("small", "full"), incomplete)
-
-
 def filter_by_prefix(names: Iterable[str], incomplete: str) -> list[str]:
     """Return the names that begin with the incomplete word, in their order; sets sorted."""
     ordered = sorted(names) if isinstance(names, (set, frozenset)) else names

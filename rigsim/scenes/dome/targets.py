@@ -25,7 +25,6 @@ from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.sensor import color_filters, expose_sensor, make_sensor
 from rigsim.targets import mirror_ball, printed_plate
-from rigsim.targets.printed_plate import Plate
 
 Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 
@@ -338,10 +337,3 @@ def _front_normal(azimuth: float, elevation: float) -> Float64Array:
     """Return the front normal of a plate rotated by angles in rad."""
     x, z = math.sin(azimuth), math.cos(azimuth)
     return np.array([math.cos(elevation) * x, math.sin(elevation), math.cos(elevation) * z])
-
-
-def make_board(kind: Literal["charuco", "white"]) -> Plate:
-    """Return the printed target of a kind, its surface flat."""
-    if kind == "charuco":
-        return printed_plate.charuco_board()
-    return printed_plate.white_plate(slope_deg=0.0, rng=np.random.default_rng(0))

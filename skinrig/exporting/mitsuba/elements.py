@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
 
-from rigsim.arrays import Float64Array
-
 FORMAT_VERSION: Final = "3.0.0"
 """Version of Mitsuba's scene format."""
 
@@ -90,12 +88,6 @@ def build_pose(position: Iterable[float], target: Iterable[float], up: Iterable[
     rows = {"origin": position, "target": target, "up": up}
     transform.append(Element("lookat", {key: _format_row(row) for key, row in rows.items()}))
     return transform
-
-
-def build_point(name: str, position_mm: Float64Array) -> Element:
-    """Return a property that is a point, mm."""
-    x, y, z = (_format_number(v) for v in position_mm)
-    return Element("point", {"name": name, "x": x, "y": y, "z": z})
 
 
 def write_scene(path: Path, children: Iterable[Element], comment: str = "") -> None:

@@ -50,7 +50,6 @@ def test_tab_completes_names(words, expected):
         (completion.complete_states, "sm", "smile"),
         (completion.complete_conditions, "lo", "lotion"),
         (completion.complete_stages, "chrom", "chromophores"),
-        (completion.complete_scales, "f", "full"),
     ],
 )
 def test_completions_begin_with_typed_text(complete, typed, one):

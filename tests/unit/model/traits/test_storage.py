@@ -10,7 +10,6 @@ from model.traits import storage as trait_storage
 from model.traits.feasible_sets import HistogramSet, NonNegativeSet
 from model.traits.space import TraitSpace
 from model.traits.storage import TraitFileError, TraitLibrary
-from model.traits.vectors import TraitError
 
 
 @pytest.fixture(scope="module")
@@ -129,12 +128,6 @@ def test_damaged_files_are_refused(library, damage, tmp_path):
     (tmp_path / "space.npz").write_bytes(content)
     with pytest.raises(TraitFileError, match=r"space\.npz: "):
         trait_storage.load(tmp_path / "space.npz")
-
-
-def test_spaces_are_found_by_their_traits(library):
-    assert list(library.spaces_with("tan")) == ["albedo"]
-    with pytest.raises(TraitError, match="got 'sweat', expected one of age, lotion, rare, tan"):
-        library.spaces_with("sweat")
 
 
 def test_packaged_traits_are_simulated_and_report_truth_error():
