@@ -236,7 +236,7 @@ def test_long_judgment_is_answered_last_and_once(judged):
     assert port.listen(0.1) == []  # the retry is not answered again
     assert int(port.ask("STAT?")) & 32
     target.wait_for(lambda: lit_spans_s(target, "led149"))
-    assert lit_spans_s(target, "led149")[0] == pytest.approx(0.1, abs=DARK_SLACK_S)
+    assert lit_spans_s(target, "led149")[0] <= 0.1 + DARK_SLACK_S  # SEQ:ARM puts the light out
     assert judged_s > 0.2  # without care the LED would have been lit for this long
 
 
