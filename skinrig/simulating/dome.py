@@ -122,15 +122,14 @@ def _expect_images(
     scene.expect_channels([number[name] for name in lit])
     pixels = [view.width_px * view.height_px for view in rig.views]
     largest, total = (np.dtype(np.float32).itemsize * n for n in (max(pixels), sum(pixels)))
-    if largest <= SMALL_IMAGE_BYTES and total * len(lit) <= IMAGE_CACHE_BYTES or order.move:
+    fits = largest <= SMALL_IMAGE_BYTES and total * len(lit) <= IMAGE_CACHE_BYTES
+    if fits or order.move:
         return nullcontext()
     need = forecast_resources("simulate dome", count_megapixels(rig, plan))
     free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
     folder, most_bytes = order.out.parent, max(0, int(free) // 2)
     names = [view.name for view in rig.views]
-    return cast(
-        AbstractContextManager[None], scene.images.render_ahead(names, folder, most_bytes)
-    )
+    return cast(AbstractContextManager[None], scene.images.render_ahead(names, folder, most_bytes))
 
 
 def _manifest_settings(

@@ -58,9 +58,7 @@ class LightImages:
         self._groups = tuple(tuple(ordered[k : k + MOSAIC_LIGHTS]) for k in starts)
 
     @contextmanager
-    def render_ahead(
-        self, cameras: Sequence[str], folder: Path, most_bytes: int
-    ) -> Iterator[None]:
+    def render_ahead(self, cameras: Sequence[str], folder: Path, most_bytes: int) -> Iterator[None]:
         """Store images in a file, see `ImageFile`, and render them before they are requested.
 
         Parameters
@@ -92,7 +90,7 @@ class LightImages:
         if self._file is None:
             images = dict(zip(group, self._render(camera, group, t_s), strict=True))
             for other, image in images.items():
-                self._latest.get((camera, other, t_s), lambda image=image: image)
+                self._latest.put((camera, other, t_s), image)
             return images[light]
         if (stored := self._file.load(key)) is not None:
             return stored

@@ -34,8 +34,7 @@ from rigsim.light.interreflection import InterreflectionSettings, interreflectio
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.olat import CameraSettings, Hits, Lamp
-from rigsim.light.olat_kernels import SKIN_ROWS
+from rigsim.light.olat import CameraSettings, Hits
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.mitsuba.variant import VariantChoice
@@ -415,9 +414,8 @@ class DomeScene(FaceScene):
             return seen.scene.render(seen, light, lit.color, lit.added())
         lamp, added = self._rows.lamp(light, t_s), lit.added()
         visible = olat.is_lamp_visible(hits, self._visible_rows(view, t_s)[1], lamp)
-        diffuse = not added.replaces_diffuse
-        how: dict[str, Any] = {"diffuse": diffuse, "relief": added.visible}
-        return olat.shade_rows(hits, lamp, visible, lit.color, added.interior, **how)
+        args = (hits, lamp, visible, lit.color, added.interior)
+        return olat.shade_rows(*args, diffuse=not added.replaces_diffuse, relief=added.visible)
 
     def _light_scene(
         self, view: View, lights: Sequence[int], t_s: float

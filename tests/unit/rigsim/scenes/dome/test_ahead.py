@@ -90,11 +90,15 @@ def test_end_waits_for_the_group_at_work():
         time.sleep(0.05)
         done.append(group)
 
-    with pytest.raises(KeyboardInterrupt), RenderAhead(GROUPS, render) as ahead:
-        ahead.begin_after(GROUPS[0])
-        while not ahead._is_busy:
-            time.sleep(1e-3)
-        raise KeyboardInterrupt
+    def stop(ahead: RenderAhead) -> None:
+        with ahead:
+            ahead.begin_after(GROUPS[0])
+            while not ahead._is_busy:
+                time.sleep(1e-3)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stop(RenderAhead(GROUPS, render))
     count = len(done)
     time.sleep(0.1)
     assert len(done) == count < 5

@@ -39,7 +39,8 @@ def test_stored_image_is_returned_bit_for_bit(image, tmp_path):
     images.add(("C00", 2, 0.0), dark)
     assert np.array_equal(images.load(("C00", 1, 0.0)), image)
     assert np.array_equal(images.load(("C00", 2, 0.0)), dark)
-    assert images.has(("C00", 1, 0.0)) and not images.has(("C00", 3, 0.0))
+    assert images.has(("C00", 1, 0.0))
+    assert not images.has(("C00", 3, 0.0))
     assert images.load(("C00", 3, 0.0)) is None
     assert not list(tmp_path.iterdir()), "the file has a name"
 
