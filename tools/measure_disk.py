@@ -78,10 +78,16 @@ def measure(folder: Path) -> tuple[float, float, float, float]:
     view, rng = rig.views[0], np.random.default_rng(0)
     shape = view.height_px, view.width_px
     pixels = rng.integers(view.black_level, view.white_level, shape).astype(np.uint16)
-    levels = {"pattern": view.cfa, "black": view.black_level, "white": view.white_level}
     pending = session.pending_frames()[:FRAMES]
     frames = [
-        raw.encode_dng(pixels, step_id=step.id, session_id=session.id, **levels)
+        raw.encode_dng(
+            pixels,
+            pattern=view.cfa,
+            black=view.black_level,
+            white=view.white_level,
+            step_id=step.id,
+            session_id=session.id,
+        )
         for step, _ in pending
     ]
     size_mb = sum(map(len, frames)) * 1e-6
