@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -47,6 +48,7 @@ class LightImages:
         self._groups: tuple[tuple[int, ...], ...] = ()
         self._file: ImageFile | None = None
         self._ahead: RenderAhead | None = None
+        self._lock = threading.RLock()  # clients of a served rig have threads of their own
 
     def expect(self, lights: Sequence[int]) -> None:
         """Render these lights in groups: a camera's request of one renders its group.
@@ -71,18 +73,21 @@ class LightImages:
         file = self._file = ImageFile(folder, most_bytes)
         groups = [(camera, group) for group in self._groups for camera in cameras]
         with RenderAhead(groups, lambda one: self._store(file, *one)) as self._ahead:
-            yield
-        self._ahead = None
+            try:
+                yield
+            finally:
+                self._ahead = None
 
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
         """Do not render ahead meanwhile: renderers are called by one thread at a time."""
-        with nullcontext() if self._ahead is None else self._ahead.exclusive():
+        with self._lock, nullcontext() if self._ahead is None else self._ahead.exclusive():
             yield
 
     def get(self, key: ImageKey) -> Float32Array:
         """Return the image of a key; it is rendered unless it is stored."""
-        return self._latest.get(key, lambda: self._find(key))
+        with self._lock:
+            return self._latest.get(key, lambda: self._find(key))
 
     def _find(self, key: ImageKey) -> Float32Array:
         camera, light, t_s = key

@@ -1,5 +1,8 @@
 """Images of single lights, kept in memory and in a file."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -86,6 +89,23 @@ def test_request_renders_its_group_once(lights):
             assert np.array_equal(images.get((camera, light, 0.0)), lights.of(camera, light))
     one = [*range(20, 12, -1), *range(12, 4, -1), *range(4, 0, -1)]
     assert lights.rendered == [(camera, light) for camera in ("C00", "C01") for light in one]
+
+
+def test_requests_of_several_threads_render_one_after_another(image):
+    inside, most = [], []
+
+    def render(camera, lights, t_s):
+        inside.append(camera)
+        most.append(len(inside))
+        time.sleep(1e-3)
+        inside.remove(camera)
+        return [image for _ in lights]
+
+    images = LightImages(render)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda k: images.get((f"C{k}", k, 0.0)), range(24)))
+    assert len(most) == 24
+    assert max(most) == 1
 
 
 def test_images_ahead_are_rendered_once_each(lights, tmp_path, monkeypatch):
