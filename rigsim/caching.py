@@ -28,12 +28,16 @@ class LruCache(Generic[KeyT, ValueT]):
     def get(self, key: KeyT, make: Callable[[], ValueT]) -> ValueT:
         """Return the cached value of a key, or compute it."""
         if key not in self._values:
-            value = make()
-            while self._values and len(self._values) >= self._most(value):
-                self._values.popitem(last=False)
-            self._values[key] = value
+            self.put(key, make())
         self._values.move_to_end(key)
         return self._values[key]
+
+    def put(self, key: KeyT, value: ValueT) -> None:
+        """Cache a value as the latest one."""
+        self._values.pop(key, None)
+        while self._values and len(self._values) >= self._most(value):
+            self._values.popitem(last=False)
+        self._values[key] = value
 
     def clear(self) -> None:
         """Clear the cache."""

@@ -267,7 +267,7 @@ def _interpolate(values, faces, prim, weight):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, nogil=True)
 def _sample(texture, uv, mask):  # type: ignore[no-untyped-def]
     height, width, channels = texture.shape
     out = np.zeros((uv.shape[0], channels), np.float32)

@@ -219,7 +219,7 @@ def _factorize(area, conductance, step):  # type: ignore[no-untyped-def]
     return own, before, after
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, nogil=True)
 def _flow(field, own, before, after):  # type: ignore[no-untyped-def]
     """Solve one implicit step along the columns in place, a block of columns at a time."""
     channels, rows, columns = field.shape

@@ -103,6 +103,7 @@ class ReliefShadow:
                 for k in range(directions)
             ]
         )
+        self._highest = _bound_horizons(self._du, self._dv, self._horizon.max(axis=0))
 
     def highest_horizons(self, covered: BoolArray, count: int) -> tuple[Int64Array, Int64Array]:
         """Return rows and columns of the covered texels with the highest horizons, (n,) each."""
@@ -139,10 +140,26 @@ class ReliefShadow:
         ndarray of float32
             Shape (n,), 0 to 1.
         """
-        out = np.empty(len(uv), np.float32)
+        light = np.asarray(light_mm, np.float64)
+        return self.visible_fractions(uv, position_mm, light[None], [radius_mm])[0]
+
+    def visible_fractions(
+        self, uv: Float32Array, position_mm: Float32Array, lights_mm: ArrayLike, radii_mm: ArrayLike
+    ) -> Float32Array:
+        """Return `visible_fraction` of several lights, shape (L, n).
+
+        Parameters
+        ----------
+        uv, position_mm
+            As for `visible_fraction`.
+        lights_mm, radii_mm
+            Centers of the lights, shape (L, 3), and radii of their discs, shape (L,).
+        """
+        lights = np.ascontiguousarray(lights_mm, np.float64)
+        out = np.empty((len(lights), len(uv)), np.float32)
         points = (np.ascontiguousarray(part, np.float32) for part in (uv, position_mm))
-        light = (np.asarray(light_mm, np.float64), radius_mm)
-        _visible_fraction(*points, *light, self._du, self._dv, self._horizon, out)
+        relief = (self._du, self._dv, self._horizon, self._highest)
+        _visible_fractions(*points, lights, np.asarray(radii_mm, np.float64), *relief, out)
         return out
 
     def on_texture(
@@ -205,8 +222,35 @@ def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
             top += 1
 
 
-@njit(parallel=True, cache=True)
-def _visible_fraction(uv, position, light, radius, du, dv, horizon, out):  # type: ignore[no-untyped-def]
+HORIZON_MARGIN: Final = 1e-6
+"""Margin of `_bound_horizons` for rounding errors."""
+
+
+def _bound_horizons(
+    du_mm: Float32Array, dv_mm: Float32Array, highest: Float32Array
+) -> Float32Array:
+    """Return an upper bound of the sine of each texel's horizon in all directions, (N, N).
+
+    A texel's shortest length is the square root of the smaller eigenvalue of its metric.
+    """
+    size = du_mm.shape[0]
+    along, down = du_mm.astype(np.float64), dv_mm.astype(np.float64)
+    aa, bb = (along**2).sum(axis=-1), (down**2).sum(axis=-1)
+    half = np.hypot(0.5 * (aa - bb), (along * down).sum(axis=-1))
+    squared = 0.5 * (aa + bb) - half - HORIZON_MARGIN * (aa + bb)
+    shortest_um = 1e3 / size * np.sqrt(np.maximum(squared, MIN_SQUARED_LENGTH))
+    tangent = highest / shortest_um
+    return np.asarray(tangent / np.hypot(1.0, tangent) + HORIZON_MARGIN, np.float32)
+
+
+MIN_SQUARED_LENGTH: Final = 1e-12
+"""Smallest squared length of a texture's side along a direction, mm^2."""
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _visible_fractions(  # type: ignore[no-untyped-def]
+    uv, position, lights, radii, du, dv, horizon, highest, out
+):
     size = du.shape[0]
     turns = horizon.shape[0]
     for i in prange(uv.shape[0]):
@@ -216,33 +260,39 @@ def _visible_fraction(uv, position, light, radius, du, dv, horizon, out):  # typ
         b0, b1, b2 = float(dv[row, column, 0]), float(dv[row, column, 1]), float(dv[row, column, 2])
         n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
         area = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-        w0, w1, w2 = light[0] - position[i, 0], light[1] - position[i, 1], light[2] - position[i, 2]
-        far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
-        out[i] = 1.0
-        if area <= 0.0 or far <= 0.0:
-            continue
-        up = (w0 * n0 + w1 * n1 + w2 * n2) / (area * far)
-        if up <= 0.0:
-            continue  # behind the mesh; rays test that occlusion
-        # the direction over the texture: w = a du + b dv + c n
-        p, q = w0 * a0 + w1 * a1 + w2 * a2, w0 * b0 + w1 * b1 + w2 * b2
-        aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
-        ab = a0 * b0 + a1 * b1 + a2 * b2
-        a, b = bb * p - ab * q, aa * q - ab * p
-        length = math.hypot(a, b)
-        if length <= 0.0:
-            continue  # overhead
-        a, b = a / length, b / length
-        texel_um = 1e3 / size * math.sqrt(max(a * a * aa + 2.0 * a * b * ab + b * b * bb, 1e-12))
-        turn = math.atan2(b, a) / (2.0 * math.pi) % 1.0 * turns
-        k = int(turn)
-        share = turn - k
-        low, high = horizon[k % turns, row, column], horizon[(k + 1) % turns, row, column]
-        edge = math.atan(((1.0 - share) * float(low) + share * float(high)) / texel_um)
-        soft = max(radius / far, HORIZON_SOFTNESS_RAD)
-        out[i] = min(max(0.5 + (math.asin(min(up, 1.0)) - edge) / (2.0 * soft), 0.0), 1.0)
-        if edge <= 0.0:
-            out[i] = 1.0
+        for light in range(lights.shape[0]):
+            w0 = lights[light, 0] - position[i, 0]
+            w1 = lights[light, 1] - position[i, 1]
+            w2 = lights[light, 2] - position[i, 2]
+            far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
+            out[light, i] = 1.0
+            if area <= 0.0 or far <= 0.0:
+                continue
+            up = (w0 * n0 + w1 * n1 + w2 * n2) / (area * far)
+            if up <= 0.0:
+                continue  # behind the mesh; rays test that occlusion
+            soft = max(radii[light] / far, HORIZON_SOFTNESS_RAD)
+            if up >= highest[row, column] + soft:
+                continue  # above all horizons, as sin(a + b) <= sin(a) + b
+            # the direction over the texture: w = a du + b dv + c n
+            p, q = w0 * a0 + w1 * a1 + w2 * a2, w0 * b0 + w1 * b1 + w2 * b2
+            aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+            ab = a0 * b0 + a1 * b1 + a2 * b2
+            a, b = bb * p - ab * q, aa * q - ab * p
+            length = math.hypot(a, b)
+            if length <= 0.0:
+                continue  # overhead
+            a, b = a / length, b / length
+            squared = max(a * a * aa + 2.0 * a * b * ab + b * b * bb, MIN_SQUARED_LENGTH)
+            texel_um = 1e3 / size * math.sqrt(squared)
+            turn = math.atan2(b, a) / (2.0 * math.pi) % 1.0 * turns
+            k = int(turn)
+            share = turn - k
+            low, high = horizon[k % turns, row, column], horizon[(k + 1) % turns, row, column]
+            edge = math.atan(((1.0 - share) * float(low) + share * float(high)) / texel_um)
+            if edge > 0.0:
+                seen = 0.5 + (math.asin(min(up, 1.0)) - edge) / (2.0 * soft)
+                out[light, i] = min(max(seen, 0.0), 1.0)
 
 
 ELEVATION_NODES: Final = 6

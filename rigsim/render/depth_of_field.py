@@ -18,19 +18,19 @@ to the kernel: the far rings of diffraction, and the glare of real lenses, are n
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from capture.rig import View
 from rigsim.arrays import Float32Array, Float64Array, Int32Array, UInt8Array
 from rigsim.geometry.mesh import Mesh
+from rigsim.render import lens_kernels as kernels
 from rigsim.render.lens_blur import BlurError, Lens, focused_lens
+from rigsim.render.lens_kernels import MOSAIC_LIGHTS
 
 DEFOCUS_STEP_PX: Final = 0.1
 MAX_WEIGHT_DEPTHS: Final = 33
@@ -52,9 +52,6 @@ DEPTH_GAP_PX: Final = 3.0
 
 DEPTH_RANGE_FACTOR: Final = 1.2
 """Step of the depth ranges of tables."""
-
-DEPTH_GAP_BINS: Final = 64
-"""Number of depth bins in the search for a gap."""
 
 MAX_FREQUENCY: Final = 6.0
 """Highest frequency of the sum, in cycles per sample; squares transmit 0.2 % of it."""
@@ -278,7 +275,7 @@ class LensImage:
         self._samples = (*samples, spread.table, spread.radius)
         self._cut = np.full(shape, np.inf, np.float32)
         self._far = np.zeros(shape, np.float32)
-        _layers(*self._samples, np.float32(spread.gap_mm), self._cut, self._far)
+        kernels.find_layers(*self._samples, np.float32(spread.gap_mm), self._cut, self._far)
 
     def render(self, rows: Float32Array) -> Float32Array:
         """Return the image of samples with given radiance.
@@ -296,145 +293,51 @@ class LensImage:
         out = np.zeros((*self.shape, rows.shape[1]), np.float32)
         if len(rows):
             light = np.ascontiguousarray(rows, np.float32)
-            _gather(*self._samples, self._cut, self._far, light, out)
+            kernels.gather(*self._samples, self._cut, self._far, light, out)
         return out
 
-    def render_mosaic(self, columns: Sequence[ArrayLike], cell: ArrayLike) -> Float32Array:
-        """Return the channel of each pixel's filter, the same numbers as those of `render`.
+    def render_mosaics(self, light: Float32Array, cell: ArrayLike) -> Float32Array:
+        """Return the channel of each pixel's filter under several lights.
 
         Parameters
         ----------
-        columns
-            Radiance of each sample by channel, C of shape (n,).
+        light
+            Radiance of each sample by channel and light, shape (C, n, `MOSAIC_LIGHTS`).
         cell
             Channels of the sensor's 2 x 2 cell, below C, shape (2, 2).
 
         Returns
         -------
         ndarray of float32
-            Shape (H, W).
+            Shape (H, W, `MOSAIC_LIGHTS`), the same numbers as those of `render`.
         """
-        out = np.zeros(self.shape, np.float32)
-        light = np.array(columns, np.float32)
+        out = np.zeros((*self.shape, MOSAIC_LIGHTS), np.float32)
         if light.size:
-            channels = np.ascontiguousarray(cell, np.int64)
-            _gather_mosaic(*self._samples, self._cut, self._far, light, channels, out)
+            weights, toward = self.spread.table, self._samples[4]
+            kernels.gather_mosaics(
+                *self._weight_places(),
+                toward,
+                weights.reshape(-1),
+                weights.shape[2],
+                self.spread.radius,
+                self._cut,
+                self._far,
+                np.ascontiguousarray(light, np.float32),
+                np.ascontiguousarray(cell, np.int64),
+                out,
+            )
         return out
 
+    def _weight_places(self) -> tuple[Int32Array, Int32Array]:
+        """Return each pixel's first sample, and each sample's place in the flat table.
 
-@njit(parallel=True, cache=True)
-def _layers(  # type: ignore[no-untyped-def]
-    lookup, first, slot, slices, toward, table, radius, gap, cut, far
-):
-    """Find each pixel's far depths and the factors of the weights of both layers."""
-    height, width = lookup.shape
-    wide = 2 * radius + 1
-    per_pixel = table.shape[2]
-    for y in prange(height):
-        depth = np.empty(wide * wide * per_pixel, np.float32)
-        share = np.empty(wide * wide * per_pixel, np.float32)
-        filled = np.empty(DEPTH_GAP_BINS, np.uint8)
-        for x in range(width):
-            count, missing = 0, np.float32(0.0)
-            total, inside = np.float32(0.0), np.float32(0.0)
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-            for b in range(wide * wide):
-                v, u = y + b // wide - radius, x + b % wide - radius
-                if v < 0 or v >= height or u < 0 or u >= width:
-                    continue  # beyond its border the image is extrapolated
-                for s in range(per_pixel):
-                    inside += table[0, b, s]
-                q = lookup[v, u]
-                if q < 0:
-                    missing += np.float32(1.0)
-                    continue
-                missing += np.float32(per_pixel - first[q + 1] + first[q])
-                for i in range(first[q], first[q + 1]):
-                    w = table[slices[i], b, slot[i]]
-                    depth[count], share[count] = toward[i], w
-                    low, high = min(low, toward[i]), max(high, toward[i])
-                    total += w
-                    count += 1
-            if count == 0 or total <= 0.0:
-                continue
-            near = np.float32(0.0)
-            if high - low > gap:
-                # the widest run of empty bins is the gap, up to the width of a bin
-                filled[:] = 0
-                per_mm = np.float32(DEPTH_GAP_BINS - 1) / (high - low)
-                for k in range(count):
-                    filled[int((depth[k] - low) * per_mm)] = 1
-                run, widest, end = 0, 0, 0
-                for k in range(DEPTH_GAP_BINS):
-                    run = 0 if filled[k] else run + 1
-                    if run > widest:
-                        widest, end = run, k
-                if widest > gap * per_mm:
-                    middle = np.float32(end + 1) - np.float32(0.5) * np.float32(widest)
-                    cut[y, x] = low + middle / per_mm
-                    for k in range(count):
-                        if depth[k] >= cut[y, x]:
-                            near += share[k]
-                    if near > inside:  # one steep slope: no second layer
-                        cut[y, x], near = np.float32(np.inf), np.float32(0.0)
-            rest = total - near
-            free = max(inside - near, np.float32(0.0))
-            if rest <= np.float32(1e-9):
-                far[y, x] = np.float32(0.0)
-            elif missing > 0:  # no light there
-                far[y, x] = min(np.float32(1.0), free / rest) / inside
-            else:
-                far[y, x] = free / rest / inside
-
-
-@njit(parallel=True, cache=True)
-def _gather(  # type: ignore[no-untyped-def]
-    lookup, first, slot, slices, toward, table, radius, cut, far, rows, out
-):
-    """Sum the samples around each pixel. Unsigned indices are not wrapped, which saves time."""
-    height, width = lookup.shape
-    wide = 2 * radius + 1
-    channels = rows.shape[1]
-    for y in prange(height):
-        for x in range(width):
-            edge, behind = cut[y, x], far[y, x]
-            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
-                line = lookup[v]
-                row = (v - y + radius) * wide + radius - x
-                for u in range(max(x - radius, 0), min(x + radius + 1, width)):
-                    if line[u] < 0:
-                        continue
-                    q, b = np.uint64(line[u]), np.uint64(row + u)
-                    for sample in range(first[q], first[q + np.uint64(1)]):
-                        i = np.uint64(sample)
-                        w = table[np.uint64(slices[i]), b, np.uint64(slot[i])]
-                        w *= behind if toward[i] < edge else np.float32(1.0)
-                        for c in range(channels):
-                            out[y, x, c] += w * rows[i, c]
-
-
-@njit(parallel=True, cache=True)
-def _gather_mosaic(  # type: ignore[no-untyped-def]
-    lookup, first, slot, slices, toward, table, radius, cut, far, light, cell, out
-):
-    """Do as `_gather` for the channel of each pixel's filter; `light` has a row per channel."""
-    height, width = lookup.shape
-    wide = 2 * radius + 1
-    for y in prange(height):
-        for x in range(width):
-            column = light[cell[y % 2, x % 2]]
-            edge, behind = cut[y, x], far[y, x]
-            total = np.float32(0.0)
-            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
-                line = lookup[v]
-                row = (v - y + radius) * wide + radius - x
-                for u in range(max(x - radius, 0), min(x + radius + 1, width)):
-                    if line[u] < 0:
-                        continue
-                    q, b = np.uint64(line[u]), np.uint64(row + u)
-                    for sample in range(first[q], first[q + np.uint64(1)]):
-                        i = np.uint64(sample)
-                        w = table[np.uint64(slices[i]), b, np.uint64(slot[i])]
-                        w *= behind if toward[i] < edge else np.float32(1.0)
-                        total += w * column[i]
-            out[y, x] = total
+        Places count from a receiving pixel in column 0; the kernel shifts them to another one.
+        """
+        lookup, first, slot, slices, *_ = self._samples
+        table = self.spread.table
+        pixel = np.flatnonzero(lookup.reshape(-1) >= 0)
+        count = np.zeros(lookup.size + 1, np.int32)
+        count[pixel + 1] = np.diff(first)
+        column = np.repeat((pixel % self.shape[1]).astype(np.int32), np.diff(first))
+        depth = slices.astype(np.int32) * np.int32(table.shape[1] * table.shape[2])
+        return np.cumsum(count, dtype=np.int32), depth + slot + np.int32(table.shape[2]) * column

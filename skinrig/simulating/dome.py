@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-from collections import Counter
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -25,7 +25,7 @@ from rigsim.population.conditions import ConditionError, validate_conditions
 from rigsim.population.population import PopulationError, get_member
 from rigsim.scanner.flaws import encode_binary_ply
 from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
-from rigsim.scenes.dome.images import IMAGE_CACHE_BYTES
+from rigsim.scenes.dome.images import IMAGE_CACHE_BYTES, SMALL_IMAGE_BYTES
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.dome.stripes import scan_board
 from rigsim.scenes.dome.stripes import scan_face as scan_face_by_stripes
@@ -78,7 +78,6 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     scene = _scene(rig, order, plan)
     session = driving.open_session(order, plan, rig, settings, scene)
     with driving.release_on_error(session):
-        _store_images(scene, order, rig, plan)
         attach = order.target is None and not order.scanner
         scan = _attach_scan(session, scene, order) if attach else {}
 
@@ -88,9 +87,9 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
 
     # a target has no eyes; a subject closes them if the plan refuses open eyes
     closed = order.target is not None or light["open_eyes"] != "allowed"
-    rig_seconds = driving.drive_plan(
-        order, session, rig, scene, prompt, eyes="closed" if closed else "open"
-    )
+    eyes = "closed" if closed else "open"
+    with _expect_images(scene, order, rig, plan):
+        rig_seconds = driving.drive_plan(order, session, rig, scene, prompt, eyes=eyes)
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
@@ -109,19 +108,28 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
 
 
-def _store_images(scene: Any, order: DomeOrder, rig: Rig, plan: Plan) -> None:
-    """Let a scene store images in a file if the plan returns to more than memory caches.
+def _expect_images(
+    scene: Any, order: DomeOrder, rig: Rig, plan: Plan
+) -> AbstractContextManager[None]:
+    """Let a scene render lights in groups, and ahead of their requests where memory is too small.
 
-    The file takes half of the space that the session leaves.
+    Images ahead are in a file, which takes half of the space that the session leaves.
     """
-    uses = Counter(light for step in plan.steps for light in step_lights(step))
-    pixels = sum(view.width_px * view.height_px for view in rig.views)
-    image_bytes = np.dtype(np.float32).itemsize * pixels * len(uses)
-    returns = max(uses.values(), default=0) > 1
-    if order.target is None and returns and image_bytes > IMAGE_CACHE_BYTES:
-        need = forecast_resources("simulate dome", count_megapixels(rig, plan))
-        free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
-        scene.store_images(order.out.parent, max(0, int(free) // 2))
+    if order.target is not None:
+        return nullcontext()
+    lit = dict.fromkeys(light for step in plan.steps for light in step_lights(step))
+    number = {light.name: k for k, light in enumerate(rig.lights)}
+    scene.expect_channels([number[name] for name in lit])
+    pixels = [view.width_px * view.height_px for view in rig.views]
+    largest, total = (np.dtype(np.float32).itemsize * n for n in (max(pixels), sum(pixels)))
+    fits = largest <= SMALL_IMAGE_BYTES and total * len(lit) <= IMAGE_CACHE_BYTES
+    if fits or order.move:
+        return nullcontext()
+    need = forecast_resources("simulate dome", count_megapixels(rig, plan))
+    free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
+    folder, most_bytes = order.out.parent, max(0, int(free) // 2)
+    names = [view.name for view in rig.views]
+    return cast(AbstractContextManager[None], scene.images.render_ahead(names, folder, most_bytes))
 
 
 def _manifest_settings(

@@ -8,6 +8,7 @@ import pytest
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
+from rigsim.boxes.led_table import LedPulse
 from rigsim.mitsuba.variant import choose_variant
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
@@ -15,6 +16,7 @@ from rigsim.scenes.reference import dome_session
 from rigsim.scenes.reference.directions import DirectionalReflectance
 from rigsim.scenes.reference.dome_session import VoxelDomeScene
 from rigsim.scenes.reference.face_skin import FaceDirections
+from rigsim.sensor import apply_cfa
 from rigsim.subject import make_subject
 from skinrig.simulating import reference
 from skinrig.simulating.dome import small_dome
@@ -76,6 +78,22 @@ def test_lambertian_voxels_have_light_of_session(dome, face):
     assert np.all(ratio[1] > 1.02)
     bright = expected > 0.2 * expected.max()
     assert np.percentile(np.abs(images[0][bright] / expected[bright] - 1.0), 90) < 0.03
+
+
+@pytest.mark.long
+def test_exposure_has_the_light_of_voxels(dome, face):
+    """Voxels that reflect half have half the light, whatever their boundary reflects."""
+    view, pulse = dome.views[0], LedPulse(led=0, level=1.0, t_on_s=0.0, t_off_s=0.01)
+    found = []
+    for factor in (1.0, 0.5):
+        voxels = {view.spectral_sensitivity: lambertian((factor,) * 4)}
+        scene = VoxelDomeScene(dome, face, voxels)
+        light = apply_cfa(scene.radiance(view.name, [0])[0], view.cfa)
+        frame = scene.exposure(view.name, pops=[pulse], exposure_s=0.1, seed=1)
+        found.append((light.mean(), frame.mean() - view.black_level))
+    light, signal = np.array(found).T
+    assert light[1] / light[0] < 0.9
+    assert signal[1] / signal[0] == pytest.approx(light[1] / light[0], rel=0.02)
 
 
 @pytest.mark.long

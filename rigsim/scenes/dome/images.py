@@ -2,9 +2,10 @@
 
 import os
 import tempfile
+import threading
 import weakref
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,8 @@ import numpy as np
 
 from rigsim.arrays import Float32Array
 from rigsim.caching import LruCache
+from rigsim.render.lens_kernels import MOSAIC_LIGHTS
+from rigsim.scenes.dome.ahead import RenderAhead
 
 MAX_CACHED_IMAGES: Final = 16
 """Cached images of any size: one light of all cameras, so that a second exposure costs nothing."""
@@ -21,36 +24,103 @@ SMALL_IMAGE_BYTES: Final = 2**22
 
 ImageKey = tuple[str, int, float]
 """Camera, light, and time of the head's pose."""
-Render = Callable[[], Float32Array]
+RenderLights = Callable[[str, Sequence[int], float], Sequence[Float32Array]]
+"""Returns a camera's images of up to `MOSAIC_LIGHTS` lights at a time, s."""
 
 
 class LightImages:
-    """Images of single lights: the latest in memory, and all in a file if there is one."""
+    """Images of single lights: the latest in memory, and all in a file if there is one.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    render
+        Renders images that are not stored.
+    """
+
+    def __init__(self, render: RenderLights) -> None:
+        self._render = render
         self._latest: LruCache[ImageKey, Float32Array] = LruCache(
             lambda image: max(
                 MAX_CACHED_IMAGES,
                 IMAGE_CACHE_BYTES // image.nbytes if image.nbytes <= SMALL_IMAGE_BYTES else 0,
             )
         )
+        self._groups: tuple[tuple[int, ...], ...] = ()
         self._file: ImageFile | None = None
+        self._ahead: RenderAhead | None = None
+        self._lock = threading.RLock()  # clients of a served rig have threads of their own
 
-    def store(self, folder: Path, most_bytes: int) -> None:
-        """Store all later images in a file, see `ImageFile`."""
-        self._file = ImageFile(folder, most_bytes)
+    def expect(self, lights: Sequence[int]) -> None:
+        """Render these lights in groups: a camera's request of one renders its group.
 
-    def get(self, key: ImageKey, render: Render) -> Float32Array:
-        """Return the image of a key, or render it."""
-        file = self._file
-        return self._latest.get(key, render if file is None else lambda: file.get(key, render))
+        Memory must keep the images of all cameras, see `IMAGE_CACHE_BYTES`, or `render_ahead` them.
+        """
+        ordered = list(dict.fromkeys(lights))
+        starts = range(0, len(ordered), MOSAIC_LIGHTS)
+        self._groups = tuple(tuple(ordered[k : k + MOSAIC_LIGHTS]) for k in starts)
+
+    @contextmanager
+    def render_ahead(self, cameras: Sequence[str], folder: Path, most_bytes: int) -> Iterator[None]:
+        """Store images in a file, see `ImageFile`, and render them before they are requested.
+
+        Parameters
+        ----------
+        cameras
+            Cameras in the order of their requests; their head does not move.
+        folder, most_bytes
+            As for `ImageFile`.
+        """
+        file = self._file = ImageFile(folder, most_bytes)
+        groups = [(camera, group) for group in self._groups for camera in cameras]
+        with RenderAhead(groups, lambda one: self._store(file, *one)) as self._ahead:
+            try:
+                yield
+            finally:
+                self._ahead = None
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Do not render ahead meanwhile: renderers are called by one thread at a time."""
+        with self._lock, nullcontext() if self._ahead is None else self._ahead.exclusive():
+            yield
+
+    def get(self, key: ImageKey) -> Float32Array:
+        """Return the image of a key; it is rendered unless it is stored."""
+        with self._lock:
+            return self._latest.get(key, lambda: self._find(key))
+
+    def _find(self, key: ImageKey) -> Float32Array:
+        camera, light, t_s = key
+        group = next((one for one in self._groups if light in one), (light,))
+        if self._file is None:
+            images = dict(zip(group, self._render(camera, group, t_s), strict=True))
+            for other, image in images.items():
+                self._latest.put((camera, other, t_s), image)
+            return images[light]
+        if (stored := self._file.load(key)) is not None:
+            return stored
+        with self.undisturbed():
+            self._store(self._file, camera, group)
+            stored = self._file.load(key)
+            if stored is None:
+                return self._render(camera, [light], t_s)[0]
+        if self._ahead is not None:
+            self._ahead.begin_after((camera, group))
+        return stored
+
+    def _store(self, file: "ImageFile", camera: str, group: Sequence[int]) -> None:
+        """Render and store the images of a group that are not stored; none without room."""
+        missing = [light for light in group if not file.has((camera, light, 0.0))]
+        if missing and file.has_room(len(missing)):
+            for light, image in zip(missing, self._render(camera, missing, 0.0), strict=True):
+                file.add((camera, light, 0.0), image)
 
 
 class ImageFile:
     """Images in a temporary file without a name, which ends with the process.
 
-    Dark rows above and below an image are not stored. An image that does not fit is rendered each
-    time.
+    Dark rows above and below an image are not stored. After a failed write nothing more is stored.
+    One thread adds images at a time; others may load them.
 
     Parameters
     ----------
@@ -62,9 +132,9 @@ class ImageFile:
     Examples
     --------
     >>> images = ImageFile(Path(tempfile.gettempdir()), 1000)
-    >>> first = images.get(("C00", 0, 0.0), lambda: np.ones((4, 3), np.float32))
-    >>> bool((images.get(("C00", 0, 0.0), lambda: np.zeros(0, np.float32)) == first).all())
-    True
+    >>> images.add(("C00", 0, 0.0), np.ones((4, 3), np.float32))
+    >>> float(images.load(("C00", 0, 0.0)).sum()), images.load(("C00", 1, 0.0))
+    (12.0, None)
     """
 
     def __init__(self, folder: Path, most_bytes: int) -> None:
@@ -72,29 +142,43 @@ class ImageFile:
         file = tempfile.TemporaryFile(dir=folder, buffering=0)
         weakref.finalize(self, file.close)
         self._file = file.fileno()
-        self._most_bytes, self._end = most_bytes, 0
+        self._most_bytes, self._end, self._largest = most_bytes, 0, 0
         self._stored: dict[ImageKey, tuple[int, tuple[int, ...], int, int]] = {}
         """Offset, shape, first row and number of rows by key."""
 
-    def get(self, key: ImageKey, render: Render) -> Float32Array:
-        """Return the stored image of a key, or render and store it."""
-        if key in self._stored:
-            offset, shape, top, count = self._stored[key]
-            out = np.zeros(shape, np.float32)
-            rows = out[top : top + count]
+    def has(self, key: ImageKey) -> bool:
+        """Return whether an image is stored."""
+        return key in self._stored
+
+    def has_room(self, count: int) -> bool:
+        """Return whether some images of the largest size so far fit."""
+        return self._end + count * self._largest <= self._most_bytes
+
+    def load(self, key: ImageKey) -> Float32Array | None:
+        """Return a stored image; None when there is none, or when the file cannot be read."""
+        if key not in self._stored:
+            return None
+        offset, shape, top, count = self._stored[key]
+        out = np.zeros(shape, np.float32)
+        rows = out[top : top + count]
+        with suppress(OSError):
             if not rows.nbytes or os.preadv(self._file, [rows.data], offset) == rows.nbytes:
                 return out
-        image = render()
-        self._append(key, image)
-        return image
+        return None
 
-    def _append(self, key: ImageKey, image: Float32Array) -> None:
+    def add(self, key: ImageKey, image: Float32Array) -> None:
+        """Store an image unless it does not fit."""
         lit = np.flatnonzero(image.reshape(len(image), -1).any(axis=1))
         top, end = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
         rows = np.ascontiguousarray(image[top:end])
+        self._largest = max(self._largest, rows.nbytes)
         if self._end + rows.nbytes > self._most_bytes:
             return
+        written = 0
         with suppress(OSError):  # of a full disk
-            if not rows.nbytes or os.pwrite(self._file, rows.data, self._end) == rows.nbytes:
-                self._stored[key] = self._end, image.shape, top, end - top
-                self._end += rows.nbytes
+            written = os.pwrite(self._file, rows.data, self._end) if rows.nbytes else 0
+        if written < rows.nbytes:
+            self._most_bytes = 0
+            return
+        self._stored[key] = self._end, image.shape, top, end - top
+        self._end += rows.nbytes

@@ -1,7 +1,7 @@
 """Render the dome by a Mitsuba scene: mesh, skin, LEDs and cameras, one light at a time."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from rigsim.mitsuba.rig_camera import describe_camera
 from rigsim.mitsuba.scene_radiance import load_description
 from rigsim.mitsuba.startup import load_mitsuba
 from rigsim.mitsuba.variant import VariantChoice
+from rigsim.render.lens_kernels import MOSAIC_LIGHTS
 from rigsim.sensor import apply_cfa, color_filters, filter_channels
 
 
@@ -48,6 +49,18 @@ class RenderedView:
         return dataclasses.replace(self.hits, normal=normal, surface=surface)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LitScene:
+    """One LED that lights a scene."""
+
+    light: int
+    """Number of the LED."""
+    color: Float32Array
+    """Intensity on its axis, shape (3,), see `rigsim.light.led_light`."""
+    added: Callable[[], AddedLight]
+    """Returns subsurface light, and the relief's visible fraction."""
+
+
 class MitsubaScene:
     """A face or a target in front of LEDs, as a Mitsuba scene.
 
@@ -64,6 +77,7 @@ class MitsubaScene:
     def __init__(self, mesh: Mesh, material: dict[str, Any], choice: VariantChoice) -> None:
         self._choice = choice
         self._lamps: tuple[Lamp, ...] = ()
+        self._memory = np.zeros(0, np.float32)
         mi = load_mitsuba(choice)
         self._is_skin = material["type"] == "skincoat"
         self._scene = load_description(
@@ -123,7 +137,7 @@ class MitsubaScene:
         return lens_of_hits(hits, view, settings) if settings.optics else hits
 
     def render(
-        self, seen: RenderedView, light: int, color: Float32Array, added: AddedLight, cfa: str = ""
+        self, seen: RenderedView, light: int, color: Float32Array, added: AddedLight
     ) -> Float32Array:
         """Return the image of one light.
 
@@ -137,31 +151,72 @@ class MitsubaScene:
             Intensity on its axis, shape (3,), see `rigsim.light.led_light`.
         added
             Subsurface light, and the relief's visible fraction.
-        cfa
-            Pattern of Bayer filters; empty: all channels of each pixel.
 
         Returns
         -------
         ndarray of float32
-            Shape (H, W, 3), behind the filters (H, W), in full scales per second, averaged over
-            whole pixels.
+            Shape (H, W, 3), in full scales per second, averaged over whole pixels.
         """
         if not seen.image_hits.count:
-            return np.zeros(seen.hits.shape if cfa else (*seen.hits.shape, 3), np.float32)
+            return np.zeros((*seen.hits.shape, 3), np.float32)
+        parts = self._shade(seen, light, added)
+        scale = np.float32(np.pi) * np.asarray(color, np.float32)
+        if seen.hits.lens is None:
+            return self._integrator.develop(seen.image_hits, parts, scale)
+        columns = [np.concatenate([np.array(p[c]) for p in parts]) for c in range(3)]
+        return seen.hits.lens.render(np.stack(columns, axis=1)) * scale
+
+    def render_mosaics(
+        self, seen: RenderedView, lights: Sequence[LitScene], cfa: str
+    ) -> list[Float32Array]:
+        """Return the images of lights behind a Bayer sensor's filters.
+
+        Parameters
+        ----------
+        seen
+            A camera's hits in this scene.
+        lights
+            Up to `MOSAIC_LIGHTS` lights.
+        cfa
+            Pattern of the filters.
+
+        Returns
+        -------
+        list of ndarray of float32
+            Shape (H, W), the numbers of `render` in each pixel's channel.
+        """
+        lens, count = seen.hits.lens, seen.image_hits.count
+        if lens is None or not count:
+            return [
+                apply_cfa(self.render(seen, one.light, one.color, one.added()), cfa)
+                for one in lights
+            ]
+        size = 3 * count * MOSAIC_LIGHTS
+        if self._memory.size < size:
+            self._memory = np.zeros(size, np.float32)
+        # other lights in places that are not used make images that are not used
+        rows = self._memory[:size].reshape(3, count, MOSAIC_LIGHTS)
+        for k, one in enumerate(lights):
+            parts = self._shade(seen, one.light, one.added())
+            for part, (_, place) in zip(parts, seen.image_hits.parts(), strict=True):
+                for channel in range(3):
+                    rows[channel, place, k] = part[channel].numpy()
+        images = lens.render_mosaics(rows, filter_channels(cfa))
+        return [
+            color_filters(images[..., k], np.float32(np.pi) * one.color, cfa)
+            for k, one in enumerate(lights)
+        ]
+
+    def _shade(self, seen: RenderedView, light: int, added: AddedLight) -> list[Any]:
+        """Return the radiance of the hits of each band, by channel, for an intensity of 1."""
         load_mitsuba(self._choice)  # the variant is a state of the process
         if self._lamps is not seen.lamps:
             self._leds.set_table(_table(seen.lamps))
             self._lamps = seen.lamps
-        parts = self._integrator.shade(self._scene, seen.image_hits, self._leds, light, added)
-        scale = np.float32(np.pi) * np.asarray(color, np.float32)
-        if seen.hits.lens is None:
-            image = self._integrator.develop(seen.image_hits, parts, scale)
-            return apply_cfa(image, cfa) if cfa else image
-        columns = [np.concatenate([np.array(p[c]) for p in parts]) for c in range(3)]
-        if not cfa:
-            return seen.hits.lens.render(np.stack(columns, axis=1)) * scale
-        image = seen.hits.lens.render_mosaic(columns, filter_channels(cfa))
-        return color_filters(image, scale, cfa)
+        shaded: list[Any] = self._integrator.shade(
+            self._scene, seen.image_hits, self._leds, light, added
+        )
+        return shaded
 
 
 def _table(lamps: Sequence[Lamp]) -> Float32Array:

@@ -1,7 +1,8 @@
 """Visible points of a subject in the dome, as rows that any light can illuminate."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,9 @@ from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import CameraSettings, Hits, Lamp, find_hits
 from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
+from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.skin_material import describe_skin, describe_target
+from rigsim.mitsuba.image_hits import NOTHING_ADDED, AddedLight
 from rigsim.render import Caster, GBuffer
 from rigsim.scenes.dome.rendering import MitsubaScene, RenderedView
 from rigsim.scenes.exposing import SceneError
@@ -195,13 +198,15 @@ class DomeSubsurfaceRadiance:
         )
         self._latest: tuple[tuple[str, int, float], Float32Array] | None = None
 
-    def on_rows(self, hits: Hits, lamp: Lamp, view: View, light: int, t_s: float) -> Float32Array:
+    def on_rows(
+        self, uv: Float32Array, lamp: Lamp, view: View, light: int, t_s: float
+    ) -> Float32Array:
         """Return the subsurface light at a camera's rows.
 
         Parameters
         ----------
-        hits
-            The rows.
+        uv
+            Texture coordinates of the rows, shape (n, 2).
         lamp
             The light, in the frame of the mesh.
         view
@@ -226,8 +231,60 @@ class DomeSubsurfaceRadiance:
             unit, kept = self._kept.get(key, lit)
             # all cameras request the same light in turn
             self._latest = key, unit * kept.astype(np.float32)
-        uv = hits.texture_uv()
         return sample(self._latest[1], uv, np.ones(len(uv), np.bool_))
+
+
+class AddedSkinLight:
+    """What a face adds to the direct light on a camera's rows.
+
+    Parameters
+    ----------
+    glow
+        Its subsurface light; None: none.
+    relief
+        Shadows of its texture's relief; None: none.
+    replaces_diffuse
+        Whether the subsurface light includes the diffuse term.
+    """
+
+    def __init__(
+        self,
+        glow: DomeSubsurfaceRadiance | None,
+        relief: ReliefShadow | None,
+        replaces_diffuse: bool,
+    ) -> None:
+        self._glow, self._relief, self._replaces_diffuse = glow, relief, replaces_diffuse
+
+    def of_lights(
+        self, hits: Hits, view: View, lights: Sequence[int], lamps: Sequence[Lamp], t_s: float
+    ) -> list[Callable[[], AddedLight]]:
+        """Return a function per light that computes what is added.
+
+        Parameters
+        ----------
+        hits
+            A camera's rows; only skin adds light.
+        view, lights, t_s
+            As for `DomeSubsurfaceRadiance.on_rows`.
+        lamps
+            The lights, in the frame of the mesh.
+        """
+        glow = self._glow
+        if hits.kind != SKIN_ROWS or (glow is None and self._relief is None):
+            return [lambda: NOTHING_ADDED] * len(lights)
+        uv = hits.texture_uv()
+        reliefs: Sequence[Float32Array | None] = [None] * len(lights)
+        if self._relief is not None:
+            places, radii = [lamp.position_mm for lamp in lamps], [lamp.radius_mm for lamp in lamps]
+            reliefs = list(self._relief.visible_fractions(uv, hits.position_mm, places, radii))
+
+        def add(light: int, lamp: Lamp, relief: Float32Array | None) -> AddedLight:
+            if glow is None:
+                return AddedLight(None, relief)
+            inner = glow.on_rows(uv, lamp, view, light, t_s)
+            return AddedLight(inner, relief, self._replaces_diffuse)
+
+        return [partial(add, *one) for one in zip(lights, lamps, reliefs, strict=True)]
 
 
 def observe_face(

@@ -16,8 +16,6 @@ responses, dead LEDs and crossed wires.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -36,11 +34,9 @@ from rigsim.light.interreflection import InterreflectionSettings, interreflectio
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.olat import CameraSettings, Hits, Lamp
-from rigsim.light.olat_kernels import SKIN_ROWS
+from rigsim.light.olat import CameraSettings, Hits
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
-from rigsim.mitsuba.image_hits import AddedLight
 from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.dome import min_noise, sample_led_light, select_dome_effects
@@ -51,7 +47,8 @@ from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome.images import LightImages
-from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, normalize
+from rigsim.scenes.dome.rendering import LitScene
+from rigsim.scenes.dome.rows import AddedSkinLight, DomeRows, DomeSubsurfaceRadiance, normalize
 from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
 from rigsim.sensor import apply_cfa
 from rigsim.subject import SimulatedSubject
@@ -145,15 +142,16 @@ class DomeScene(FaceScene):
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
         self._relief: ReliefShadow | None = None
-        self._glow: DomeSubsurfaceRadiance | None = None
+        glow: DomeSubsurfaceRadiance | None = None
         if isinstance(self.subject, SimulatedSubject):
             if self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT):
                 self._relief = ReliefShadow(self.subject)
             if self.subsurface or self.interreflections:
-                self._glow = DomeSubsurfaceRadiance(self._scattering)
+                glow = DomeSubsurfaceRadiance(self._scattering)
+        self._added = AddedSkinLight(glow, self._relief, self.subsurface)
         how = CameraSettings(subpixels, self._illuminant, self.optics)
         self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
-        self._images = LightImages()  # a capture returns to each light in its next pass
+        self.images = LightImages(self._mosaics)
 
     @property
     def variant(self) -> VariantChoice:
@@ -251,14 +249,14 @@ class DomeScene(FaceScene):
             Raw DN, shape (H, W).
         """
         if self.stripes is not None and view_name in self.stripes.view_names:
-            return self.stripes.exposure(view_name, pops=pops, exposure_s=exposure_s, seed=seed)
+            with self.images.undisturbed():
+                return self.stripes.exposure(view_name, pops=pops, exposure_s=exposure_s, seed=seed)
         view = self._camera(view_name)
 
         def frame(pulse: LedPulse) -> Float32Array:
             middle = self._rows.pose_time_s(0.5 * (pulse.t_on_s + pulse.t_off_s))
             led = self.dome.light_of_channel(pulse.led)
-            render = partial(self._mosaic, view, led, middle)
-            return self._images.get((view.name, led, middle), render)
+            return self.images.get((view.name, led, middle))
 
         return self._expose(
             view,
@@ -389,55 +387,56 @@ class DomeScene(FaceScene):
         layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
         return dilate_texture(layers, self._face().atlas.covered)
 
-    def store_images(self, folder: Path, most_bytes: int) -> None:
-        """Store the images of each light in a file, see `ImageFile`; none of a head that moves."""
+    def expect_channels(self, channels: Sequence[int]) -> None:
+        """Render the lights of channels in groups, in this order; not of a head that moves."""
         if self._rows.is_still:
-            self._images.store(folder, most_bytes)
+            self.images.expect([self.dome.light_of_channel(channel) for channel in channels])
 
-    def _mosaic(self, view: View, light: int, t_s: float) -> Float32Array:
-        """Return the light behind each pixel's filter, (H, W), see `radiance`."""
-        if view.cfa == "MONO" or self._caster.choice.renderer != "mitsuba":
-            return apply_cfa(self._render(view, light, t_s), view.cfa)
-        return self._shade(view, light, t_s, view.cfa)
+    def _mosaics(self, view_name: str, lights: Sequence[int], t_s: float) -> list[Float32Array]:
+        """Return the light behind each pixel's filter, (H, W), of up to `MOSAIC_LIGHTS` lights."""
+        view = self._camera(view_name)
+        if view.cfa == "MONO" or self._caster.choice.renderer != "mitsuba" or self._is_cap:
+            return [apply_cfa(self._render(view, light, t_s), view.cfa) for light in lights]
+        lit, _ = self._light_scene(view, lights, t_s)
+        seen = self._rows.rendered_view(view, t_s, self._texture)
+        return seen.scene.render_mosaics(seen, lit, view.cfa)
+
+    @property
+    def _is_cap(self) -> bool:
+        return isinstance(self.subject, Target) and self.subject.kind == "cap"
 
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
-        return self._shade(view, light, t_s)
-
-    def _shade(self, view: View, light: int, t_s: float, cfa: str = "") -> Float32Array:
-        if not 0 <= light < len(self.rig.lights):
-            raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
-        shape = (view.height_px, view.width_px)
-        if isinstance(self.subject, Target) and self.subject.kind == "cap":
-            return np.zeros(shape if cfa else (*shape, 3), np.float32)
-        hits, caster = self._visible_rows(view, t_s)
-        lamp = self._rows.lamp(light, t_s)
-        gain = np.float32(self.dome.gain.get(view.name, 1.0))
-        color = gain * self.intensity(light, view_name=view.name)
-        glow = None
-        if self._glow is not None and hits.kind == SKIN_ROWS:
-            glow = self._glow.on_rows(hits, lamp, view, light, t_s)
-        diffuse = not (self.subsurface and glow is not None)
-        relief = self._relief_of(hits, lamp)
+        if self._is_cap:
+            return np.zeros((view.height_px, view.width_px, 3), np.float32)
+        (lit,), hits = self._light_scene(view, [light], t_s)
         if self._caster.choice.renderer == "mitsuba":
             seen = self._rows.rendered_view(view, t_s, self._texture)
-            added = AddedLight(glow, relief, not diffuse)
-            return seen.scene.render(seen, light, color, added, cfa)
-        visible = olat.is_lamp_visible(hits, caster, lamp)
-        return olat.shade_rows(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
+            return seen.scene.render(seen, light, lit.color, lit.added())
+        lamp, added = self._rows.lamp(light, t_s), lit.added()
+        visible = olat.is_lamp_visible(hits, self._visible_rows(view, t_s)[1], lamp)
+        args = (hits, lamp, visible, lit.color, added.interior)
+        return olat.shade_rows(*args, diffuse=not added.replaces_diffuse, relief=added.visible)
+
+    def _light_scene(
+        self, view: View, lights: Sequence[int], t_s: float
+    ) -> tuple[list[LitScene], Hits]:
+        """Return a camera's rows and what lights them, with these lights."""
+        for light in lights:
+            if not 0 <= light < len(self.rig.lights):
+                raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
+        hits, _ = self._visible_rows(view, t_s)
+        lamps = [self._rows.lamp(light, t_s) for light in lights]
+        added = self._added.of_lights(hits, view, lights, lamps, t_s)
+        gain = np.float32(self.dome.gain.get(view.name, 1.0))
+        return [
+            LitScene(light, gain * self.intensity(light, view_name=view.name), add)
+            for light, add in zip(lights, added, strict=True)
+        ], hits
 
     def _visible_rows(self, view: View, t_s: float) -> tuple[Hits, Caster]:
         if self._caster.choice.renderer == "mitsuba":
             return self._rows.rendered_view(view, t_s, self._texture).hits, self._caster
         return self._rows.visible_rows(view, t_s, self._texture)
-
-    def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
-        """Return the fraction of a light that the texture's relief leaves to each row."""
-        if self._relief is None or hits.kind != SKIN_ROWS:
-            return None
-        uv = hits.texture_uv()
-        return self._relief.visible_fraction(
-            uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm
-        )
 
 
 def _toward_origin(light: Light) -> Float64Array:

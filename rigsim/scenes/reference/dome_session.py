@@ -4,7 +4,7 @@ Rays and shadows are traced on the face's mesh. `rigsim.scenes.reference.face_sk
 blur excepted nothing else of the session's own renderer is used.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -25,6 +25,7 @@ from rigsim.needs.effects import EffectSelection, SceneEffects, omitted_effects
 from rigsim.scenes.dome.rows import normalize
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.reference.face_skin import FaceDirections, FaceReflection, render_face_directions
+from rigsim.sensor import apply_cfa
 from rigsim.subject import SimulatedSubject
 
 BLOCK_ROWS: Final = 2**17
@@ -114,6 +115,10 @@ class VoxelDomeScene(DomeScene):
     def _surface(self, camera: str) -> SkinSurface:
         bare = super()._surface(camera)
         return replace(bare, fuzz=np.zeros_like(bare.fuzz))
+
+    def _mosaics(self, view_name: str, lights: Sequence[int], t_s: float) -> list[Float32Array]:
+        view = self._camera(view_name)
+        return [apply_cfa(self._render(view, light, t_s), view.cfa) for light in lights]
 
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
         hits, caster = self._rows.visible_rows(view, t_s, self._texture)

@@ -54,6 +54,29 @@ def seen_from(shadow: ReliefShadow, azimuth_deg: float, elevation_deg: float, ac
     return shadow.on_texture(points, 1e6 * way)
 
 
+def test_lights_above_bound_have_fraction_of_full_computation(monkeypatch):
+    """A skewed, stretched texture with grooves; the bound decides for lights above all horizons."""
+    rng = np.random.default_rng(3)
+    height = 60.0 * np.cumsum(rng.standard_normal((SIDE, SIDE)), axis=1)
+    shadow = level(height, across=1.5)
+    shadow._dv[..., 0] = 0.4 * MM * SIDE
+    points = rng.uniform(0.0, 48.0, (5000, 3)).astype(np.float32)
+    points[:, 2] = 0.0
+    uv = rng.random((5000, 2)).astype(np.float32)
+    ways = rng.standard_normal((12, 3))
+    lights = 700.0 * np.abs(ways) / np.linalg.norm(ways, axis=1, keepdims=True)
+    radii = np.linspace(0.0, 40.0, 12)
+    found = shadow.visible_fractions(uv, points, lights, radii)
+    assert 0.02 < (found < 1.0).mean() < 0.98
+    for fraction, light, radius in zip(found, lights, radii, strict=True):
+        one = shadow.visible_fraction(uv, points, light, radius_mm=radius)
+        assert np.array_equal(one, fraction)
+    monkeypatch.setattr(shadow, "_highest", np.full_like(shadow._highest, np.inf))
+    assert np.array_equal(found, shadow.visible_fractions(uv, points, lights, radii))
+    monkeypatch.setattr(shadow, "_highest", np.zeros_like(shadow._highest))
+    assert not np.array_equal(found, shadow.visible_fractions(uv, points, lights, radii))
+
+
 @pytest.mark.parametrize("across", [1.0, 2.0])
 @pytest.mark.parametrize(
     ("azimuth_deg", "before"), [(0.0, "left"), (180.0, "right"), (90.0, "below")]

@@ -23,6 +23,7 @@ from rigsim.render.depth_of_field import (
     tabulate_lens_defocus,
 )
 from rigsim.render.lens_blur import BlurError, focused_lens
+from rigsim.render.lens_kernels import MOSAIC_LIGHTS
 from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.sensor import apply_cfa, filter_channels
@@ -243,18 +244,26 @@ def test_focus_is_at_target_unless_view_overrides(rig):
     assert depth_before_focus(nearer, tip)[0] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_mosaic_has_the_channels_of_the_image(rig):
+def test_mosaics_have_channels_of_each_image(rig):
     """Bit for bit, at an edge in depth, with pixels that lack samples, and an odd size."""
     rng = np.random.default_rng(4)
     depth = np.where(np.arange(46) < 20, NEAR_MM, FAR_MM) * np.ones((38, 1))
     depth[rng.random(depth.shape) < 0.1] = np.nan
     order = pixel_order(np.isfinite(depth), K)[0]
-    rows = rng.random((len(order), 3), np.float32)
+    light = rng.random((3, len(order), MOSAIC_LIGHTS), np.float32)
     lens = planes(wide_open(rig, 2.0), depth)
+    images = [lens.render(light[..., k].T) for k in range(MOSAIC_LIGHTS)]
     for cfa in ("RGGB", "GBRG"):
-        mosaic = lens.render_mosaic(rows.T, filter_channels(cfa))
-        assert np.array_equal(mosaic, apply_cfa(lens.render(rows), cfa))
-    assert not np.array_equal(mosaic, apply_cfa(lens.render(rows), "RGGB"))
+        mosaics = lens.render_mosaics(light, filter_channels(cfa))
+        for k, image in enumerate(images):
+            assert np.array_equal(mosaics[..., k], apply_cfa(image, cfa))
+    assert not np.array_equal(mosaics[..., 0], apply_cfa(images[0], "RGGB"))
+
+
+def test_mosaics_without_samples_are_dark(rig):
+    lens = planes(wide_open(rig, 2.0), np.full((8, 8), np.nan))
+    dark = np.zeros((3, 0, MOSAIC_LIGHTS), np.float32)
+    assert not lens.render_mosaics(dark, filter_channels("RGGB")).any()
 
 
 def test_weights_of_plain_sum_agree_with_kernel(rig):

@@ -1,5 +1,8 @@
 """Images of single lights, kept in memory and in a file."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -13,52 +16,115 @@ def image() -> np.ndarray:
     return made
 
 
-def refuse() -> np.ndarray:
-    raise AssertionError("rendered twice")
+class Lights:
+    """Renders images of their own for each light, and counts them."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        self.image, self.rendered = image, []
+
+    def of(self, camera: str, light: int) -> np.ndarray:
+        return self.image * np.float32(1 + light + 100 * int(camera[1:]))
+
+    def __call__(self, camera, lights, t_s) -> list[np.ndarray]:
+        self.rendered += [(camera, light) for light in lights]
+        return [self.of(camera, light) for light in lights]
+
+
+@pytest.fixture
+def lights(image) -> Lights:
+    return Lights(image)
 
 
 def test_stored_image_is_returned_bit_for_bit(image, tmp_path):
     images = ImageFile(tmp_path, 10**6)
     dark = np.zeros((4, 4), np.float32)
-    for key, made in ((("C00", 1, 0.0), image), (("C00", 2, 0.0), dark)):
-        assert images.get(key, lambda made=made: made) is made
-    assert np.array_equal(images.get(("C00", 1, 0.0), refuse), image)
-    assert np.array_equal(images.get(("C00", 2, 0.0), refuse), dark)
+    images.add(("C00", 1, 0.0), image)
+    images.add(("C00", 2, 0.0), dark)
+    assert np.array_equal(images.load(("C00", 1, 0.0)), image)
+    assert np.array_equal(images.load(("C00", 2, 0.0)), dark)
+    assert images.has(("C00", 1, 0.0))
+    assert not images.has(("C00", 3, 0.0))
+    assert images.load(("C00", 3, 0.0)) is None
     assert not list(tmp_path.iterdir()), "the file has a name"
 
 
-def test_image_beyond_size_of_file_renders_again(image, tmp_path):
+def test_file_stores_no_image_beyond_its_size(image, tmp_path):
     """Six of twelve rows are lit, 168 bytes."""
     images = ImageFile(tmp_path, 2 * 168)
-    count = []
-    for _ in range(2):
-        for light in range(3):
-            images.get(("C00", light, 0.0), lambda: count.append(1) or image)
-    assert len(count) == 4
+    for light in range(3):
+        images.add(("C00", light, 0.0), image)
+    assert [images.has(("C00", light, 0.0)) for light in range(3)] == [True, True, False]
+    assert not images.has_room(1)
 
 
-def test_failing_disk_renders_again(image, tmp_path, monkeypatch):
-    images = ImageFile(tmp_path, 10**6)
+@pytest.mark.parametrize("call", ["pwrite", "preadv"])
+def test_images_of_failing_disk_render_again(lights, tmp_path, monkeypatch, call):
+    images = LightImages(lights)
+    images.expect([0, 1])
 
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("os.pwrite", fail)
-    for _ in range(2):
-        assert images.get(("C00", 0, 0.0), lambda: image) is image
-
-
-def test_latest_images_need_no_file(image):
-    images = LightImages()
-    images.get(("C00", 0, 0.0), lambda: image)
-    assert images.get(("C00", 0, 0.0), refuse) is image
-
-
-def test_images_pushed_out_of_memory_come_from_file(image, tmp_path, monkeypatch):
+    monkeypatch.setattr(f"os.{call}", fail)
+    monkeypatch.setattr("rigsim.scenes.dome.images.MAX_CACHED_IMAGES", 1)
     monkeypatch.setattr("rigsim.scenes.dome.images.IMAGE_CACHE_BYTES", 1)
-    images = LightImages()
-    images.store(tmp_path, 10**6)
-    for light in range(40):
-        images.get(("C00", light, 0.0), lambda light=light: image + light)
-    for light in range(40):
-        assert np.array_equal(images.get(("C00", light, 0.0), refuse), image + light)
+    with images.render_ahead(["C00"], tmp_path, 10**6):
+        for light in (0, 1, 0, 1):
+            assert np.array_equal(images.get(("C00", light, 0.0)), lights.of("C00", light))
+    assert len(lights.rendered) > 4
+
+
+def test_latest_images_need_no_file(lights):
+    images = LightImages(lights)
+    first = images.get(("C00", 0, 0.0))
+    assert images.get(("C00", 0, 0.0)) is first
+    assert lights.rendered == [("C00", 0)]
+
+
+def test_request_renders_its_group_once(lights):
+    images = LightImages(lights)
+    images.expect([*range(20, 0, -1), 20])
+    for camera in ("C00", "C01"):
+        for light in (13, 20, 12, 3):
+            assert np.array_equal(images.get((camera, light, 0.0)), lights.of(camera, light))
+    one = [*range(20, 12, -1), *range(12, 4, -1), *range(4, 0, -1)]
+    assert lights.rendered == [(camera, light) for camera in ("C00", "C01") for light in one]
+
+
+def test_requests_of_several_threads_render_one_after_another(image):
+    inside, most = [], []
+
+    def render(camera, lights, t_s):
+        inside.append(camera)
+        most.append(len(inside))
+        time.sleep(1e-3)
+        inside.remove(camera)
+        return [image for _ in lights]
+
+    images = LightImages(render)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda k: images.get((f"C{k}", k, 0.0)), range(24)))
+    assert len(most) == 24
+    assert max(most) == 1
+
+
+def test_images_ahead_are_rendered_once_each(lights, tmp_path, monkeypatch):
+    monkeypatch.setattr("rigsim.scenes.dome.images.IMAGE_CACHE_BYTES", 1)
+    images = LightImages(lights)
+    images.expect(range(40))
+    asked = [(camera, light) for camera in ("C00", "C01") for light in range(40)]
+    with images.render_ahead(["C00", "C01"], tmp_path, 10**6):
+        for _ in range(2):
+            for camera, light in asked:
+                assert np.array_equal(images.get((camera, light, 0.0)), lights.of(camera, light))
+    assert sorted(lights.rendered) == asked
+
+
+def test_full_file_lets_requests_render_one_light(lights, tmp_path, monkeypatch):
+    monkeypatch.setattr("rigsim.scenes.dome.images.IMAGE_CACHE_BYTES", 1)
+    images = LightImages(lights)
+    images.expect(range(24))
+    with images.render_ahead(["C00"], tmp_path, 8 * 168):
+        for light in range(24):
+            assert np.array_equal(images.get(("C00", light, 0.0)), lights.of("C00", light))
+    assert sorted(lights.rendered) == [("C00", light) for light in range(24)]

@@ -110,6 +110,34 @@ def test_actual_dome_has_own_gains_dead_lights_wires(rig, white):
     assert (crossed.mean() - 64.0) / (straight.mean() - 64.0) == pytest.approx(1.0, rel=0.01)
 
 
+@pytest.mark.parametrize("subject", ["face", "white"])
+def test_lights_in_groups_expose_as_single_ones(rig, face, tmp_path, monkeypatch, subject):
+    """Bit for bit: with all effects, of one light, of crossed wires, and ahead of requests."""
+    seen = face if subject == "face" else make_target("white")
+    axes = np.array([-np.array(light.position_mm) for light in rig.lights])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    built = ActualDome(rig, rig, axes, dead=frozenset({"top"}), wiring=(1, 0, 2, 3, 4))
+    scenes = [DomeScene(rig, seen, dome=built, seed=2) for _ in range(3)]
+    scenes[1].expect_channels(range(5))
+    scenes[2].expect_channels([4, 2, 0])
+
+    def frames(scene: DomeScene) -> list[np.ndarray]:
+        pulses = [[Pulse(k, 1.0, 0.0, 0.03)] for k in range(5)]
+        pulses.append([pulse for one in pulses for pulse in one])
+        return [
+            scene.exposure("C", pops=pops, exposure_s=0.1, seed=n) for n, pops in enumerate(pulses)
+        ]
+
+    single, grouped = frames(scenes[0]), frames(scenes[1])
+    monkeypatch.setattr("rigsim.scenes.dome.images.IMAGE_CACHE_BYTES", 1)
+    with scenes[2].images.render_ahead(["C"], tmp_path, 10**7):
+        ahead = frames(scenes[2])
+    assert np.ptp(single[0]) > 100
+    for one, two, three in zip(single, grouped, ahead, strict=True):
+        assert np.array_equal(one, two)
+        assert np.array_equal(one, three)
+
+
 def test_distorted_image_shows_points_at_lens_projection(rig, face):
     """Tolerance: the middle of what a pixel of 3 mm covers, and rows kept as float32."""
     built = build_dome(rig, seed=2, tolerances=DomeTolerances(distortion=0.2))
