@@ -13,11 +13,16 @@ NOTABLE_S = 0.02
 """A shorter setup or teardown without a message is not worth sending."""
 
 
+ARCHITECTURE = "tests/architecture"
+OF_ARCHITECTURE = frozenset({"tests/properties/test_every_function_has_one.py"})
+"""Files elsewhere that read the syntax trees of the whole product."""
+
+
 def name_unit(file):
     """Return the unit of a file: a folder of unit tests, or of the architecture, or the file."""
     parts = PurePosixPath(file).parts
-    if parts[:2] == ("tests", "architecture"):
-        return "/".join(parts[:2])
+    if file.startswith(f"{ARCHITECTURE}/") or file in OF_ARCHITECTURE:
+        return ARCHITECTURE
     if parts[:2] == ("tests", "unit") and len(parts) > 4:
         return "/".join(parts[:4])
     return file
