@@ -6,7 +6,6 @@ one process that runs them in turn makes these once. With a process per file, ea
 
 from pathlib import PurePosixPath
 
-import pytest
 from _pytest.runner import runtestprotocol
 
 NOTABLE_S = 0.02
@@ -51,7 +50,6 @@ def pytest_xdist_make_scheduler(config, log):
             node.send_runtest_some([self._numbers[one] for one, done in unit.items() if not done])
 
     return LoadUnits(config, log)
-
 
 
 def pytest_runtest_protocol(item, nextitem):

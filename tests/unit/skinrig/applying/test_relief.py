@@ -78,7 +78,8 @@ def applied(folder, sheet, out, weights, **other):
 @pytest.fixture(scope="module")
 def rest(folder, sheet, tmp_path_factory):
     """The relief of a sheet at rest, 600 x 600."""
-    return applied(folder, sheet, tmp_path_factory.mktemp("rest") / "a", {"drawn": 0.0}, size_px=600)
+    out = tmp_path_factory.mktemp("rest") / "out"
+    return applied(folder, sheet, out, {"drawn": 0.0}, size_px=600)
 
 
 def slopes(height, axis):
