@@ -53,7 +53,7 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 def pytest_runtest_protocol(item, nextitem):
-    """Run a test in a process of several, and send what says something: a result, or trouble."""
+    """Run a test in a process of several; send reports with a result, a message or a duration."""
     if not hasattr(item.config, "workerinput"):
         return None
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
