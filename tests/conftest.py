@@ -4,6 +4,7 @@ import csv
 import gc
 import ipaddress
 import os
+import re
 import signal
 import socket
 import sys
@@ -22,6 +23,7 @@ import keyword_files
 import numpy as np
 import pytest
 import real_time
+import work_units
 from _pytest.doctest import DoctestModule
 from fixtures.stale_kernels import remove_stale_kernels
 
@@ -107,6 +109,7 @@ class ExamplesAlone:
 def pytest_configure(config):
     config.pluginmanager.register(ExamplesAlone())
     config.pluginmanager.register(keyword_files)
+    config.pluginmanager.register(work_units)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):  # before any process of several compiles
@@ -119,13 +122,21 @@ def says_long(path):
     return "mark.long" in path.read_text(encoding="utf-8")
 
 
+@cache
+def is_all_long(path):
+    """Return whether a file marks all its tests `long`, by a line of its own."""
+    return re.search(r"^pytestmark = .*\bmark\.long\b", path.read_text("utf-8"), re.M) is not None
+
+
 def pytest_ignore_collect(collection_path, config):
-    """Leave unread what holds no long test where these alone are asked for.
+    """Leave unread what holds no test that is asked for: long ones alone, or all others.
 
     A file's tests are long by its own words, or by those of what it shares with others: the modules
     beside it that are no tests, and the conftest.py of each folder above.
     """
     one_of_tests = collection_path.match("test_*.py")
+    if config.getoption("markexpr") == "not long" and one_of_tests:
+        return True if is_all_long(collection_path) else None
     if config.getoption("markexpr") != "long" or not one_of_tests:
         return None
     folder = collection_path.parent
@@ -193,10 +204,15 @@ def pytest_collection_modifyitems(config, items):
     config.hook.pytest_deselected(items=[item for item in items if item.path not in part])
     items[:] = [item for item in items if item.path in part]
     number = {path: count for count, path in enumerate(tests)}  # a file's tests stay together
+    unit = {path: work_units.name_unit(path.relative_to(ROOT).as_posix()) for path in tests}
+    unit_s, unit_tests = Counter(), Counter()
+    for path in tests:
+        unit_s[unit[path]] += seconds.get(path, 0.0)
+        unit_tests[unit[path]] += tests[path]
 
     def order(item):
-        path = item.path
-        return -seconds.get(path, 0.0), -tests[path], number[path]
+        name = unit[item.path]
+        return -unit_s[name], -unit_tests[name], name, number[item.path]
 
     items.sort(key=order)
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -197,11 +198,14 @@ def check_address(url: str) -> None:
     _entry(url)
 
 
+@cache  # each call reads the metadata of all installed packages
+def _kinds() -> dict[str, importlib.metadata.EntryPoint]:
+    return {one.name: one for one in importlib.metadata.entry_points(group=CAMERA_ENTRY_POINTS)}
+
+
 def _entry(url: str) -> importlib.metadata.EntryPoint:
     kind, colon, _ = url.partition(":")
-    found = {
-        entry.name: entry for entry in importlib.metadata.entry_points(group=CAMERA_ENTRY_POINTS)
-    }
+    found = _kinds()
     if not colon or kind not in found:
         raise CameraUrlError(
             f"camera address: got {url!r}, expected KIND:REST with KIND one of "

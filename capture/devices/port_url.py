@@ -3,6 +3,7 @@
 import errno
 import importlib
 import importlib.metadata
+from functools import cache
 
 import serial
 
@@ -23,11 +24,16 @@ def load_url_handler(url: str) -> None:
     scheme, separator, _ = url.partition("://")
     if not separator:
         return
-    for entry_point in importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme.lower()):
+    for entry_point in _handlers(scheme.lower()):
         # pyserial hides an ImportError of its handlers; this import raises it
         importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
         if entry_point.value not in serial.protocol_handler_packages:
             serial.protocol_handler_packages.append(entry_point.value)
+
+
+@cache  # each call reads the metadata of all installed packages
+def _handlers(scheme: str) -> tuple[importlib.metadata.EntryPoint, ...]:
+    return tuple(importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme))
 
 
 def opening_advice(url: str, kind: type[Exception], number: int | None) -> str:

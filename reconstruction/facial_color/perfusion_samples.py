@@ -130,15 +130,19 @@ class CurveSamples:
 
     def residual(self, shape: Float64Array) -> Float64Array:
         """Return the weighted square sum at the best levels, (..., P), of shapes (..., N)."""
-        level, gap = self.levels(shape)
         ones, values, curve = self._without_step(shape)
+        level, gap = self._best_levels(ones, values, curve)
         left = values - level[..., None] * ones - gap[..., None] * curve
         return np.asarray((self.weights * left**2).sum(axis=-1))
 
     def levels(self, shape: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return the best start and gap of each curve, (..., P)."""
+        return self._best_levels(*self._without_step(shape))
+
+    def _best_levels(
+        self, ones: Float64Array, values: Float64Array, b: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
         w = self.weights
-        ones, values, b = self._without_step(shape)
         total = (w * ones**2).sum(axis=-1)
         b_mean = (w * ones * b).sum(axis=-1) / total
         v_mean = (w * ones * values).sum(axis=-1) / total

@@ -154,11 +154,9 @@ class SkinTransport:
         _require_inside(at)
         tables = self._lateral_spline(np.log(at.scattering))
         table = np.tensordot(_lagrange(LATERAL_AXES.basal, at.basal)[:, 0], tables, 1)
-        # Smooth in the absorption itself, so the slope over its cube root is 0 at 0.
-        flat = (1, np.zeros(table.shape[1:]))
-        nodes = np.cbrt(LATERAL_AXES.absorption)
-        table = CubicSpline(nodes, table, bc_type=(flat, "not-a-knot"))(np.cbrt(at.absorption[0]))
-        share = np.exp(CubicSpline(np.log(LATERAL_AXES.dermis), table)(np.log(at.dermis[0])))
+        by_absorption, by_dermis = _lateral_weights()
+        table = np.tensordot(by_absorption(np.cbrt(at.absorption[0])), table, 1)
+        share = np.exp(by_dermis(np.log(at.dermis[0])) @ table)
         inside = np.cumsum(share / share.sum())
         radius = np.clip(ring_edges, 0.0, RING_EDGES[-1])
         within = PchipInterpolator(np.log(RING_EDGES[1:]), inside)(
@@ -196,6 +194,18 @@ def _lagrange(nodes: Float64Array, at: Float64Array) -> Float64Array:
                 weights[i] *= (np.asarray(at) - other) / (own - other)
     weights[np.abs(weights) < 1e-12] = 0.0
     return weights
+
+
+@cache
+def _lateral_weights() -> tuple[CubicSpline, CubicSpline]:
+    """Return splines of unit vectors: the nodes' weights in a spline through any values."""
+    # Smooth in the absorption itself, so the slope over its cube root is 0 at 0.
+    absorption, dermis = np.cbrt(LATERAL_AXES.absorption), np.log(LATERAL_AXES.dermis)
+    flat = (1, np.zeros(absorption.size))
+    return (
+        CubicSpline(absorption, np.eye(absorption.size), bc_type=(flat, "not-a-knot")),
+        CubicSpline(dermis, np.eye(dermis.size)),
+    )
 
 
 @cache

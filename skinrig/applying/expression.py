@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -326,17 +327,21 @@ def skin_reflectance(
 ) -> Any:
     """Return diffuse reflectance of skin, (H, W, 3), 0 outside; default: sRGB under D65."""
     if table is None:
-        table = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+        table = _default_table()
     color = np.zeros((*valid.shape, 3), np.float32)
     color[valid] = table.lookup(melanin[valid], hemoglobin[valid])
     return color
 
 
+@cache
+def _default_table() -> ColorTable:
+    return color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+
+
 def _color_table(path: Path | None, done: AppliedExpression) -> tuple[ColorTable, str]:
     """Return the table of a file, with its name for notes; without a file, that of sRGB."""
     if path is None:
-        made = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
-        return made, ""
+        return _default_table(), ""
     table = read_color_table(path)
     done.inputs["color_table"] = hash_file(path)
     return table, f", by the table {path.name}"

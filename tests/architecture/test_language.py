@@ -41,7 +41,25 @@ WORDS = {
 }
 """A dialect's word or idiom, and where it begins and ends."""
 
-QUESTION = re.compile(r"(What|How|Where|Whether|Which|Who|Why|When)\b")
+STEMS = {
+    "told, tells": ("tell", "told"),
+    "says, said": ("say", "said"),
+    "stands": ("stands", "stood"),
+    "anew": ("anew",),
+    "mend": ("mend",),
+    "beside": ("beside",),
+    "hangs on": ("hang",),
+    "set nothing": ("set nothing",),
+    "is no": (" no ",),
+    "a light for per light": (" a ", " an "),
+}
+"""Letters without which a text has no match: few texts are left for the slower patterns."""
+
+QUESTION = re.compile(
+    r"""(?:#[^\n]*\n|\s)*[rR]?["']{1,3}\s*(What|How|Where|Whether|Which|Who|Why|When)\b"""
+)
+"""A module's docstring that begins as a question does."""
+TEST_NAME = re.compile(r"^(?:async )?def test_(\w+)", re.MULTILINE)
 FIELD_SYMBOLS = frozenset(
     "ETA ISO F0 SCHEMA CASES RIGS STAGES FORMATS BOXES KIND DRIVER RECIPE NEUTRAL FOREHEAD".split()
 )
@@ -110,7 +128,10 @@ def hits(lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, str]]:
     known = list(lines)
     text = "\n".join(line.replace("\n", " ") for _, line in known)
     starts = list(accumulate((len(line) + 1 for _, line in known), initial=0))
+    lower = text.lower()
     for word, pattern in WORDS.items():
+        if not any(stem in lower for stem in STEMS[word]):
+            continue
         for found in pattern.finditer(text):
             number = known[bisect_right(starts, found.start()) - 1][0]
             around = text[max(found.start() - 30, 0) : found.end() + 30]
@@ -143,12 +164,13 @@ def test_manuals_hold_no_dialect():
 def test_test_names_are_short_and_plain():
     found = []
     for path in modules("tests"):
-        for node in tree_of(path).body:
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-                words = node.name.removeprefix("test_").split("_")
-                named = [text for _, text in hits(iter([(0, " ".join(words))]))]
-                if named or len(words) > 8:
-                    found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}")
+        names = TEST_NAME.findall(text_of(path))
+        named = {number for number, _ in hits(enumerate(n.replace("_", " ") for n in names))}
+        found += [
+            f"{path.relative_to(ROOT)}: test_{name}"
+            for number, name in enumerate(names)
+            if number in named or name.count("_") > 7
+        ]
     assert not found, "\n".join(found)
 
 
@@ -156,7 +178,7 @@ def test_module_docstrings_state_and_do_not_ask():
     found = [
         str(path.relative_to(ROOT))
         for path in modules(*PACKAGES, "tests", "tools")
-        if QUESTION.match(ast.get_docstring(tree_of(path)) or "")
+        if QUESTION.match(text_of(path))
     ]
     assert not found, "\n".join(found)
 
@@ -211,10 +233,27 @@ def is_lone_adverb_or_participle(name: str) -> bool:
         "rays a pixel",
         "2.1 mm a pixel",
         "measured anew",
+        "It Told and TELLS",
+        "as the table says",
+        "where it stood",
+        "to mend it",
+        "beside the map",
+        "it hangs on the light",
+        "seeds that set nothing",
     ],
 )
 def test_dialect_would_be_found(text):
     assert list(hits(iter([(1, text)])))
+
+
+def test_question_as_docstring_would_be_found():
+    assert QUESTION.match('# SPDX\n"""Where the light goes."""\n')
+    assert not QUESTION.match('"""Whereabouts of lights. What else."""\n')
+
+
+def test_long_test_name_would_be_found():
+    names = TEST_NAME.findall("def test_a_b():\n    def test_inner(): ...\n\ndef test_c(x):\n")
+    assert names == ["a_b", "c"]
 
 
 @pytest.mark.parametrize(

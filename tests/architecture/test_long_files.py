@@ -29,6 +29,15 @@ def test_file_collection_depends_on_long_tests(text, expected, tmp_path, ignored
     assert ignored(path, "") is None
 
 
+@pytest.mark.parametrize("marks", ["pytest.mark.long", "[pytest.mark.render, pytest.mark.long]"])
+def test_file_of_long_tests_alone_is_left_unread(marks, tmp_path, ignored):
+    path = tmp_path / "test_skin.py"
+    path.write_text(f"pytestmark = {marks}\n\ndef test_it(): pass\n")
+    assert ignored(path, "not long") is True
+    assert ignored(path, "long") is None
+    assert ignored(path, "") is None
+
+
 @pytest.mark.parametrize("shared", ["conftest.py", "box_harness.py"])
 def test_file_is_collected_when_shared_code_marks_long(shared, tmp_path, ignored):
     path = tmp_path / "test_skin.py"

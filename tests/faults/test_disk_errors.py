@@ -104,7 +104,7 @@ def test_fault_while_sealing_leaves_sealed_session(tmp_path, fault, monkeypatch)
 @pytest.mark.parametrize("fault", ["ENOSPC", "kill"])
 def test_fault_while_resuming_loses_nothing(tmp_path, fault):
     resumed = Counter()
-    for first in range(12, 40, 5):
+    for first in range(12, 40, 7):
         for second in range(1, 12, 2):
             path, acknowledged = tmp_path / f"s{first}-{second}", set()
             strike(path, first, fault, acknowledged)

@@ -7,6 +7,7 @@ tests/recovery and tests/system. The names are read from the sources: nothing is
 """
 
 import ast
+import re
 from functools import cache, lru_cache
 
 import pytest
@@ -124,7 +125,8 @@ def names_used(tree, names):
 
 @lru_cache(maxsize=1)
 def named_by_tests():
-    trees = [tree_of(path) for path in modules("tests")]
+    imports = re.compile(r"^\s*from (model|reconstruction)\b", re.MULTILINE)
+    trees = [tree_of(path) for path in modules("tests") if imports.search(text_of(path))]
     return set().union(*(names_used(tree, modules_of(tree)) for tree in trees))
 
 

@@ -1,7 +1,6 @@
 """Requests, retries and lost links, byte by byte, on a line that a script plays."""
 
 import errno
-import importlib.metadata
 import sys
 import termios
 import threading
@@ -10,6 +9,7 @@ import pytest
 import serial
 from fixtures.scripted_line import HELLO, Line, StillClock, ask, greet, say
 
+from capture.devices import port_url
 from capture.devices.port import (
     BadAnswer,
     BoxRebooted,
@@ -231,7 +231,7 @@ def test_an_import_error_inside_a_url_handler_shows(monkeypatch, tmp_path):
     class EntryPoint:
         name, value = "broken", "broken_handlers"
 
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group, name: [EntryPoint])
+    monkeypatch.setattr(port_url, "_handlers", lambda scheme: [EntryPoint])
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
         Port("broken://box")
     sys.modules.pop("broken_handlers", None)

@@ -22,60 +22,65 @@ def bench(request):
     yield request.param
 
 
-def test_of_a_lease(bench):
+def test_{name}(bench):
     if {stands_still}:
         ctypes.PyDLL(None).usleep(250_000)
     assert next(TIMES) == {passes_at}
 """
 
-
-@pytest.mark.parametrize(
-    ("line", "stands_still", "passes_at", "passed"),
-    [
-        ("tcp", True, 3, True),
-        ("pty", True, 1, True),
-        ("tcp", True, 6, False),  # not for ever
-        ("tcp", False, 2, True),
-        ("sim", True, 2, False),  # virtual time does not run on
-    ],
-)
-def test_failure_during_machine_stall_is_retried(line, stands_still, passes_at, passed, tmp_path):
-    run = trial(tmp_path, line=line, stands_still=stands_still, passes_at=passes_at)
-    assert run.returncode == (0 if passed else 1), run.stdout
-    assert ("1 passed" if passed else "1 failed") in run.stdout
-    repeated = f"{passes_at} attempts on a real line"
-    assert (repeated in run.stdout) is (passed and passes_at > 1)
+TRIALS = {
+    "stalled_twice": ("tcp", True, 3),
+    "stalled": ("pty", True, 1),
+    "stalled_for_ever": ("tcp", True, 6),
+    "by_chance": ("tcp", False, 2),
+    "simulated": ("sim", True, 2),  # virtual time does not run on
+    "never": ("pty", False, 0),
+}
+"""Line, whether the machine stands still, and the attempt that passes."""
 
 
-def test_failure_reports_duration_of_machine_stall(tmp_path):
-    """Whether it does in a test that is quick is chance: what never passes fails in any case."""
-    run = trial(tmp_path, line="pty", stands_still=False, passes_at=0)
-    assert run.returncode == 1, run.stdout
-    assert "nothing ran for up to" in run.stdout
-    assert "1 failed" in run.stdout
-
-
-def trial(tmp_path, **given):
+@pytest.fixture(scope="module")
+def output(tmp_path_factory):
+    """What one run of all trials prints."""
+    folder = tmp_path_factory.mktemp("trials")
     hook = (Path(__file__).parents[1] / "real_time.py").read_text("utf-8")
-    (tmp_path / "conftest.py").write_text(hook, encoding="utf-8")
-    (tmp_path / "test_trial.py").write_text(TRIAL.format(**given), encoding="utf-8")
-    return subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            "-c",
-            os.devnull,
-            "--rootdir",
-            str(tmp_path),
-            str(tmp_path),
-        ],
+    (folder / "conftest.py").write_text(hook, encoding="utf-8")
+    for name, (line, stands_still, passes_at) in TRIALS.items():
+        text = TRIAL.format(name=name, line=line, stands_still=stands_still, passes_at=passes_at)
+        (folder / f"test_{name}.py").write_text(text, encoding="utf-8")
+    options = ["-q", "-rA", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(folder)]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, str(folder)],
         capture_output=True,
         text=True,
         check=False,
-        cwd=tmp_path,
+        cwd=folder,
         env={**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
     )
+    assert run.returncode == 1, run.stdout
+    return run.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "passed"),
+    [
+        ("stalled_twice", True),
+        ("stalled", True),
+        ("stalled_for_ever", False),
+        ("by_chance", True),
+        ("simulated", False),
+    ],
+)
+def test_failure_during_machine_stall_is_retried(name, passed, output):
+    line, _, passes_at = TRIALS[name]
+    test = f"test_{name}.py::test_{name}[{line}]"
+    assert f"{'PASSED' if passed else 'FAILED'} {test}" in output
+    repeated = f"{passes_at} attempts on a real line: {test}"
+    assert (repeated in output) is (passed and passes_at > 1)
+
+
+def test_failure_reports_duration_of_machine_stall(output):
+    """Whether it does in a test that is quick is chance: what never passes fails in any case."""
+    assert "FAILED test_never.py::test_never[pty]" in output
+    section = output.split(" test_never[pty] ")[1].split("\n____")[0]
+    assert "nothing ran for up to" in section

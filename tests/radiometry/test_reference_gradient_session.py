@@ -48,8 +48,8 @@ def test_crossed_light_is_that_of_voxels(rig):
 
     Tolerance: facets leak 0.1 % through the crossed polarizers. Parallel light has facets too.
     """
-    bright, dim = (scene_of(rig, level).moments(NEUTRAL_GRIP) for level in (0.4, 0.2))
     scene = scene_of(rig, 0.4)
+    bright, dim = (one.moments(NEUTRAL_GRIP) for one in (scene, scene_of(rig, 0.2)))
     center, extinction = np.zeros(1), scene.films.light_extinction
     white = diffuser_radiance(scene.sphere, center, center, extinction=extinction)[0, 0]
     added = (bright["crossed"] - dim["crossed"])[0]

@@ -101,10 +101,11 @@ def test_failed_extreme_case_is_reported(run, word):
 
 
 def test_extremes_command_writes_table_and_report_includes_table(tmp_path, capsys):
-    assert main(["bench", "--extremes", "--stage", "hdr", "--out", str(tmp_path), "--json"]) == 0
+    command = ["bench", "--extremes", "--stage", "polarization", "--out", str(tmp_path), "--json"]
+    assert main(command) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == extremes.SCHEMA
-    assert {case["stage"] for case in document["cases"]} == {"hdr"}
+    assert {case["stage"] for case in document["cases"]} == {"polarization"}
     assert json.loads((tmp_path / "extremes.json").read_text())["cases"]
     assert "Extreme cases" in build([tmp_path])
 

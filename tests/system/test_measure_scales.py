@@ -21,9 +21,10 @@ def tool():
 
 @pytest.mark.parametrize("rig", ["flash", "dome", "gradient", "probe"])
 def test_every_step_is_a_command(tool, rig):
+    root = typer.main.get_command(app)
     for scale in ("small", "half", "full"):
         for name, words in tool.list_steps(rig, scale, 0):
-            command, left = typer.main.get_command(app), list(words)
+            command, left = root, list(words)
             while hasattr(command, "commands"):
                 command = command.commands[left.pop(0)]
             assert command.make_context(name, left).params

@@ -2,10 +2,10 @@
 
 import logging
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.optimize import least_squares
 from scipy.special import erfc
@@ -120,7 +120,8 @@ def fit_disc(
     sigma = np.maximum(sigma, 1e-9)
     data = data / scale
 
-    parts = [np.flatnonzero(color == c) for c in range(len(colors))]
+    ends = np.cumsum([0, *map(len, order)])
+    parts = [slice(int(a), int(b)) for a, b in pairwise(ends)]
     # slopes and curvature of a color have a normal prior with UNEVEN of its level as deviation
     stiff = [
         np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (SPOT_GRADIENT_PRIOR * max(v / scale, 1e-3))
@@ -156,7 +157,7 @@ def _solve_colors(
     py: Float64Array,
     weighted: Float64Array,
     sigma: Float64Array,
-    parts: list[NDArray[np.intp]],
+    parts: list[slice],
     stiff: list[Float64Array],
 ) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
     """Return residuals of each color's best linear model, its priors, and the amplitudes.

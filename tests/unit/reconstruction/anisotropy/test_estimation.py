@@ -7,7 +7,7 @@ from reconstruction.anisotropy.estimation import AnisotropyError, estimate
 
 SIXTEEN = np.deg2rad(np.arange(16) * 22.5)
 STDERR = 0.02
-NULL_CASES = 4000
+NULL_CASES = 2000
 FALSE_ALARM_OF_A_TEST = 1e-6
 
 
@@ -106,10 +106,10 @@ def test_single_bad_direction_is_not_anisotropy(rng, size):
 
 
 def test_good_directions_are_omitted_at_stated_rate(rng):
-    values, stderr = null(rng, SIXTEEN, cases=8000)
+    values, stderr = null(rng, SIXTEEN, cases=4000)
     found = estimate(SIXTEEN, values, stderr)
     assert found.outlier.any(axis=0).sum() <= most_of(
-        8000, direction_harmonics.OUTLIER_FALSE_ALARM_RATE
+        4000, direction_harmonics.OUTLIER_FALSE_ALARM_RATE
     )
 
 

@@ -53,10 +53,10 @@ def test_means_and_deviations_are_recovered_under_pixel_errors(spread, rng):
 
 
 def test_outlier_skin_is_identified_without_widening_the_rest(rng):
-    count = 3000
+    count = 2000
     truth, blood = rng.normal(-3.5, 0.15, count), rng.normal(0.4, 0.06, count)
-    truth[:300] = rng.uniform(*MELANIN_ENDS, 300).clip(MELANIN[0], MELANIN[-1])
-    blood[-240:] = rng.uniform(*BLOOD_ENDS, 240)
+    truth[:200] = rng.uniform(*MELANIN_ENDS, 200).clip(MELANIN[0], MELANIN[-1])
+    blood[-160:] = rng.uniform(*BLOOD_ENDS, 160)
     found = fitted(seen(truth, np.full(count, 0.1), blood, np.full(count, 0.03), rng))
     assert abs(found.melanin.mean + 3.5) < 0.03
     assert abs(found.melanin.sd - 0.15) < 0.03

@@ -54,7 +54,7 @@ def correct(relief, normals=None, valid=None, **settings):
     return correct_occlusion(normals, relief, valid, **(usual | settings))
 
 
-def plain_place(relief, row, column, lights):
+def plain_place(relief, row, column, lights, each):
     """Return one pixel's place in plain Python: horizons by sampling, then all lights."""
     side_y, side_x = relief.shape
 
@@ -81,7 +81,6 @@ def plain_place(relief, row, column, lights):
     circle = np.append(horizon, horizon[0])
     angles = 2 * math.pi * np.arange(HORIZON_DIRECTIONS + 1) / HORIZON_DIRECTIONS
     free = 0.5 + 0.5 * (elevation - np.interp(turn, angles, circle)) / HORIZON_SOFTNESS_RAD
-    each = specular_sums(lights, view_frame((0.0, 0.0, 1.0)), ALPHA, ETA_SKIN)
 
     def observed(place, visible):
         parts = each(normal_from_disc(place[None]), np.zeros(3)) * visible
@@ -101,8 +100,10 @@ def test_correction_equals_a_plain_sum_over_lights():
     rng = np.random.default_rng(3)
     relief = 1.5 * rng.standard_normal((9, 11)).cumsum(axis=1)
     found = disc_from_normal(correct(relief))
+    lights = even_sphere()
+    each = specular_sums(lights, view_frame((0.0, 0.0, 1.0)), ALPHA, ETA_SKIN)
     for row, column in ((0, 0), (4, 5), (8, 10), (3, 1)):
-        expected = plain_place(relief, row, column, even_sphere())
+        expected = plain_place(relief, row, column, lights, each)
         assert found[row, column] == pytest.approx(expected, abs=1e-9), (row, column)
     assert np.abs(found - disc_from_normal(normals_of(relief))).max() > 0.01
 

@@ -169,7 +169,7 @@ def test_left_out_images_are_the_wrong_ones():
 
 def test_shift_is_stated_in_pixels_of_images():
     """Images of twice the side have the same blocks, so that the shift is twice as large."""
-    stack = make("moved", 300, side=160, count=12)
+    stack = make("moved", 300, side=96, count=12)
     large = replace(stack, images=stack.images.repeat(2, 1).repeat(2, 2),
                     inside=stack.inside.repeat(2, 0).repeat(2, 1))  # fmt: skip
     small, twice = (

@@ -48,7 +48,7 @@ def test_stated_error_grows_with_unequal_lights():
     lights = dome(24, np.random.default_rng(3), 60)
     stated, error = [], []
     for spread in (0.0, 0.02, 0.15):
-        images, inside = photograph("head", lights, 3, spread=spread)
+        images, inside = photograph("head", lights, 3, spread=spread, side=64)
         found = estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
         stated.append(float(np.median(found.stderr_deg)))
         error.append(float(angle_deg(found.directions, lights).mean()))
@@ -79,7 +79,7 @@ def ring(height, count=16):
 
 
 def test_one_ring_of_lights_is_refused():
-    images, inside = photograph("head", ring(np.sqrt(0.51)), 5)
+    images, inside = photograph("head", ring(np.sqrt(0.51)), 5, side=64)
     with pytest.raises(PhotometricStereoError, match="give a list of the lights"):
         estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
 

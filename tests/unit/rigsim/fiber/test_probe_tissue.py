@@ -115,7 +115,7 @@ def test_reflectance_is_zero_unscattered_and_maximal_unabsorbed():
 
 
 def test_rotated_head_on_anisotropic_tissue_rotates_profile():
-    photons = 20_000
+    photons = 10_000
     tissue = FibrousTissue(0.05, 1.5, -1.0, 30.0)
     profiles = ProfileCache(RIG, tissue, photons=photons, seed=1, threads=1)
     along, across, between, again = (

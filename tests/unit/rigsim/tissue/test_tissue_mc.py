@@ -221,7 +221,7 @@ def test_splitting_a_layer_changes_nothing():
 def test_reweighted_paths_give_reflectance_at_more_absorption():
     layers = (Layer(0.2, 0.1, 20.0, 0.8, 1.4), Layer(inf, 0.1, 10.0, 0.8, 1.4))
     extra = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [2.0, 4.0]])
-    kept = trace_escape_paths(LayerStack(layers), photons=60_000, rng=np.random.default_rng(13))
+    kept = trace_escape_paths(LayerStack(layers), photons=30_000, rng=np.random.default_rng(13))
     each = np.array(
         [np.exp(-extra @ batch.path_mm.T) @ batch.weight / batch.photons for batch in kept]
     )
@@ -232,7 +232,7 @@ def test_reweighted_paths_give_reflectance_at_more_absorption():
             for layer, more in zip(layers, added, strict=True)
         )
         run = trace_photons(
-            LayerStack(darker), photons=60_000, rng=np.random.default_rng(14 + index)
+            LayerStack(darker), photons=30_000, rng=np.random.default_rng(14 + index)
         )
         both = np.hypot(error[index], run.reflectance_stderr)
         # False alarms: 4 standard errors of 20 batches each, below 4e-4 for each of the four.

@@ -25,11 +25,10 @@ def relief_map(seed, side=160, wave_px=1.5):
     return SkinMap((8.0 * smooth / smooth.std()).astype(np.float32), "um")
 
 
-@pytest.fixture
-def folder(tmp_path):
+def write_folder(path, wave_px=1.5):
     sites, maps, files = {}, {}, {}
     for seed, site in enumerate(("forehead", "cheek")):
-        maps[f"microrelief_{site}"] = relief_map(seed)
+        maps[f"microrelief_{site}"] = relief_map(seed, wave_px=wave_px)
         files[f"kernel_table_{site}.json"] = FOREHEAD.to_json().encode()
         sites[site] = {
             "pixel_um": 20.0,
@@ -37,12 +36,17 @@ def folder(tmp_path):
             "table": f"kernel_table_{site}.json",
         }
     part = SkinAppearance(maps, "measured", {"sites": sites}, {}, files=files)
-    dynamic.add(tmp_path / "moving", dynamic.MICROSTRUCTURE, part)
-    return tmp_path / "moving"
+    dynamic.add(path, dynamic.MICROSTRUCTURE, part)
+    return path
 
 
-@pytest.fixture
-def sheet(tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("patches") / "moving")
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory):
     """A square of 12 mm that one shape draws out by 20 % to the right."""
     x, y = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
     uv = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
@@ -51,7 +55,7 @@ def sheet(tmp_path):
     faces = np.concatenate([np.stack([k, k + 1, k + 10], 1), np.stack([k, k + 10, k + 9], 1)])
     drawn = np.zeros((1, 81, 3), np.float16)
     drawn[0, :, 0] = 0.2 * vertices[:, 0]
-    path = tmp_path / "sheet.npz"
+    path = tmp_path_factory.mktemp("sheet") / "sheet.npz"
     np.savez(
         path,
         vertices_mm=vertices,
@@ -71,11 +75,18 @@ def applied(folder, sheet, out, weights, **other):
     return apply_expression(folder, ExpressionRequest(weights), out=out, parts=MICRO, relief=relief)
 
 
+@pytest.fixture(scope="module")
+def rest(folder, sheet, tmp_path_factory):
+    """The relief of a sheet at rest, 600 x 600."""
+    out = tmp_path_factory.mktemp("rest") / "out"
+    return applied(folder, sheet, out, {"drawn": 0.0}, size_px=600)
+
+
 def slopes(height, axis):
     return np.diff(height[20:-20, 20:-20].astype(float), axis=axis).std()
 
 
-def test_drawn_out_skin_is_smoother_along_pull(folder, sheet, tmp_path):
+def test_drawn_out_skin_is_smoother_along_pull(folder, sheet, rest, tmp_path):
     done = applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=600)
     before = done.maps["displacement_neutral"].values
     after = done.maps["displacement"].values
@@ -85,14 +96,14 @@ def test_drawn_out_skin_is_smoother_along_pull(folder, sheet, tmp_path):
     assert told["stretch_s"] == pytest.approx((1.2, 1.2), abs=2e-3)
     assert told["pixel_um"] == pytest.approx(20.0, rel=1e-3)
     # at rest nothing happens to it
-    rest = applied(folder, sheet, tmp_path / "rest", {"drawn": 0.0}, size_px=600)
     np.testing.assert_array_equal(rest.maps["displacement"].values, before)
 
 
-def test_the_relief_keeps_its_size_on_the_skin(folder, sheet, tmp_path):
-    """Twice the pixels show the same waves over twice as many of them."""
-    coarse = applied(folder, sheet, tmp_path / "a", {"drawn": 0.0}, size_px=600)
-    fine = applied(folder, sheet, tmp_path / "b", {"drawn": 0.0}, size_px=1200)
+def test_the_relief_keeps_its_size_on_the_skin(sheet, tmp_path):
+    """Twice the pixels show the same waves over twice as many of them; waves of 60 um."""
+    smooth = write_folder(tmp_path / "smooth", wave_px=3.0)
+    coarse = applied(smooth, sheet, tmp_path / "a", {"drawn": 0.0}, size_px=300)
+    fine = applied(smooth, sheet, tmp_path / "b", {"drawn": 0.0}, size_px=600)
     ratio = slopes(coarse.maps["displacement"].values, 0) / slopes(
         fine.maps["displacement"].values, 0
     )
@@ -141,19 +152,15 @@ def test_spatial_noise_has_patch_height_and_deforms_alike(folder, sheet, tmp_pat
         applied(folder, sheet, tmp_path / "no", {"drawn": 1.0}, source="paint")
 
 
-def test_mesoscale_keeps_its_long_waves(folder, sheet, tmp_path):
+def test_mesoscale_keeps_its_long_waves(folder, sheet, rest, tmp_path):
     side = 150
     wave = 40.0 * np.cos(2.0 * np.pi * (np.arange(side) + 0.5) / 50.0)  # 4 mm
     path = tmp_path / "scan.npy"
     np.save(path, np.broadcast_to(wave, (side, side)))
-    how = {"size_px": 600}
-    plain, whole = (
-        applied(folder, sheet, tmp_path / name, {"drawn": 0.0}, **how, **more)
-        for name, more in (("a", {}), ("b", {"mesoscale": path}))
-    )
+    whole = applied(folder, sheet, tmp_path / "b", {"drawn": 0.0}, size_px=600, mesoscale=path)
     assert "mesoscale" in whole.inputs
     difference = whole.maps["displacement_neutral"].values.astype(float)
-    difference -= plain.maps["displacement_neutral"].values
+    difference -= rest.maps["displacement_neutral"].values
     fine = 40.0 * np.cos(2.0 * np.pi * (np.arange(600) + 0.5) / 200.0)
     np.testing.assert_allclose(difference, np.broadcast_to(fine, (600, 600)), atol=1.0)
 

@@ -300,7 +300,7 @@ def test_compression_ends_at_buckling_and_stretching_at_detachment(make):
     assert sum("omitted" in text for text in found.warnings) == 2
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_frames_of_buckled_skin_are_never_kept(make, seed):
     bench = make(short(steps=(-4, 0), patterns=["full"]), seed=seed)
     bench.run()

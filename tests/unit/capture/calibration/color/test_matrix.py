@@ -43,7 +43,7 @@ def draw_chart(patch_px, *, rng, angle_rad=0.0, noise=0.003, size=None, camera=C
 
 
 @pytest.mark.parametrize("angle_deg", [0, 7, 90, 180, 270, 200])
-@pytest.mark.parametrize("patch_px", [14, 60])
+@pytest.mark.parametrize("patch_px", [14, 40])
 def test_the_chart_is_found_at_any_orientation(angle_deg, patch_px):
     rng = np.random.default_rng(1)
     image, truth = draw_chart(
@@ -160,12 +160,12 @@ def test_stated_matrix_errors_cover_the_truth():
     """Rationale: jackknife errors of a matrix from 24 patches with 1 % scatter.
 
     Expected: coverage of one standard error between 55 % and 85 % (the jackknife is approximate,
-    and its nine numbers are correlated: 100 seeds give a standard deviation of about 3 %).
+    and its nine numbers are correlated: 40 seeds give a standard deviation of about 5 %).
     """
     truth = np.linalg.inv(CAMERA)
     xyz = colorimetry.chart_reference()
     inside = []
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng([11, seed])
         fit = fit_matrix(xyz @ CAMERA.T * (1 + 0.01 * rng.normal(size=(24, 3))), xyz)
         inside.append(np.abs(fit.matrix - truth) < fit.stderr)

@@ -48,10 +48,10 @@ def test_half_the_light_gives_the_same_reflectance():
 def test_stated_errors_match_size_of_true_errors(degree):
     """Expected: root mean square of error over stated error between 0.8 and 1.2.
 
-    12 seeds x 3 channels x 15 coefficients are 540 independent numbers: standard deviation 0.03.
+    4 seeds x 3 channels x 15 coefficients are 180 independent numbers: standard deviation 0.05.
     """
     ratios = []
-    for seed in range(12):
+    for seed in range(4):
         white = reference(np.random.default_rng([2, seed]), degree=degree)
         ratios.append(((white.signal - shading()) / white.stderr) ** 2)
     assert 0.8 < np.sqrt(np.mean(ratios)) < 1.2

@@ -1,5 +1,7 @@
 """Spots of the fibers are found by themselves, in order, with errors that hold."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -16,10 +18,12 @@ def merged(camera, light, times=SHORT_S):
     )
 
 
+def find_in(series, camera, **about):
+    return find_fiber_spots(series, camera.nominal, names=camera.names, pattern="RGGB", **about)
+
+
 def find(camera, light, **about):
-    return find_fiber_spots(
-        merged(camera, light), camera.nominal, names=camera.names, pattern="RGGB", **about
-    )
+    return find_in(merged(camera, light), camera, **about)
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +31,17 @@ def falling():
     return np.geomspace(1e5, 50.0, 28)[:, None] * np.array([0.6, 1.0, 0.5])
 
 
-def test_displaced_spots_on_rotated_row_found_within_errors(rng, fiber_camera, falling):
-    camera = fiber_camera(rng)
-    spots = find(camera, falling)
+@pytest.fixture(scope="module")
+def row(fiber_camera, falling):
+    """A camera, the merged series of a row whose light falls, and the spots found in it."""
+    camera = fiber_camera(np.random.default_rng(12345))
+    series = merged(camera, falling)
+    spots = find_in(series, camera)
+    return SimpleNamespace(camera=camera, series=series, spots=spots)
+
+
+def test_displaced_spots_on_rotated_row_found_within_errors(row):
+    camera, spots = row.camera, row.spots
     assert spots.found.all()
     assert spots.findings == ()
     away = (spots.center_px - camera.places) / spots.center_stderr_px
@@ -43,7 +55,7 @@ def test_displaced_spots_on_rotated_row_found_within_errors(rng, fiber_camera, f
     assert np.abs(camera.nominal - camera.places).max() > 1
 
 
-@pytest.mark.parametrize("shift", [(5.0, 5.0), (-5.0, -5.0), (-15.0, 8.0)])
+@pytest.mark.parametrize("shift", [(5.0, 5.0), (-15.0, 8.0)])
 def test_row_shifted_as_whole_is_found(rng, fiber_camera, falling, shift):
     camera = fiber_camera(rng, shift=shift)
     spots = find(camera, falling)
@@ -51,7 +63,7 @@ def test_row_shifted_as_whole_is_found(rng, fiber_camera, falling, shift):
     np.testing.assert_allclose(spots.shift_px, shift, atol=1.0)
 
 
-def test_dark_fiber_is_reported_at_its_expected_position(rng, fiber_camera, falling):
+def test_dark_fiber_is_reported_at_its_expected_position(rng, fiber_camera, falling, caplog):
     light = falling.copy()
     light[11] = 0.0
     camera = fiber_camera(rng)
@@ -60,6 +72,7 @@ def test_dark_fiber_is_reported_at_its_expected_position(rng, fiber_camera, fall
     assert np.linalg.norm(spots.center_px[11] - camera.places[11]) < 4
     assert "F12" in spots.findings[0]
     assert "dark" in spots.findings[0]
+    assert caplog.records == []  # all fits end before their limit
 
 
 def test_foreign_spot_is_reported_with_position(rng, fiber_camera, falling):
@@ -102,31 +115,25 @@ def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fiber_camera
     assert any("F09 and F10 end in one spot" in text for text in blind.findings)
 
 
-def test_cover_over_wrong_fiber_is_error(rng, fiber_camera, falling):
-    camera = fiber_camera(rng)
+def test_cover_over_wrong_fiber_is_error(row, falling):
+    camera = row.camera
     alone = np.zeros_like(falling)
     alone[5] = falling[5]
     with pytest.raises(
         FiberSpotError, match="only F05 uncovered the brightest spot is that of F06"
     ):
-        find(camera, falling, masks={4: merged(camera, alone, (0.01, 0.1))})
+        find_in(row.series, camera, masks={4: merged(camera, alone, (0.01, 0.1))})
 
 
-def test_spots_that_have_moved_since_are_followed(rng, fiber_camera, falling):
-    camera = fiber_camera(rng)
-    spots = find(camera, falling)
-    later = fiber_camera(rng, places=camera.places + np.array([1.3, -0.7]))
-    followed, shift = spots.track(merged(later, falling), "RGGB")
+def test_spots_that_have_moved_since_are_followed(rng, row, fiber_camera, falling):
+    later = fiber_camera(rng, places=row.camera.places + np.array([1.3, -0.7]))
+    followed, shift = row.spots.track(merged(later, falling), "RGGB")
     np.testing.assert_allclose(shift, [1.3, -0.7], atol=0.03)
     np.testing.assert_allclose(followed.center_px, later.places, atol=0.1)
 
 
-@pytest.mark.parametrize(("evaluations", "warnings"), [(30, 0), (3, 1)])
-def test_unfinished_fits_are_counted_in_one_warning(
-    rng, fiber_camera, falling, monkeypatch, caplog, evaluations, warnings
-):
-    monkeypatch.setattr(discs, "MAX_DISC_EVALUATIONS", evaluations)
-    find(fiber_camera(rng), falling)
-    assert ["28 not converged" in record.getMessage() for record in caplog.records] == (
-        [True] * warnings
-    )
+def test_unfinished_fits_are_counted_in_one_warning(row, monkeypatch, caplog):
+    monkeypatch.setattr(discs, "MAX_DISC_EVALUATIONS", 3)
+    find_in(row.series, row.camera)
+    (record,) = caplog.records
+    assert "28 not converged" in record.getMessage()

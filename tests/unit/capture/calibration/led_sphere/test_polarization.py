@@ -1,5 +1,7 @@
 """Films of a polarized sphere: fitted fluxes against the films they were made with."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -55,6 +57,13 @@ def spots(
     return readings, counted / amount, variance / amount**2, good, truth
 
 
+@cache
+def fitted(zero_deg):
+    """Return the readings of a sphere, and the films fitted to them."""
+    *data, truth = spots(np.random.default_rng(12345), zero_deg=zero_deg, turn_deg=0.3)
+    return data, truth, fit_polarizers(*data, GLASS)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("turn_deg", "seed"), [(1.0, 2), (1.0, 3), (3.0, 2)])
 def test_far_axes_converge_from_two_readings(turn_deg, seed, caplog):
@@ -66,9 +75,8 @@ def test_far_axes_converge_from_two_readings(turn_deg, seed, caplog):
 
 
 @pytest.mark.parametrize("zero_deg", [0.0, 0.6, -10.0])
-def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
-    *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
-    fit = fit_polarizers(*data, GLASS)
+def test_analyzer_polarizers_and_axes_are_within_their_errors(zero_deg):
+    data, truth, fit = fitted(zero_deg)
     assert abs(np.degrees(fit.zero_rad - truth["zero"])) < 0.1
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
     for leak, error, true in zip(
@@ -92,9 +100,9 @@ def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
 
 
 @pytest.mark.parametrize("zero_deg", [0.6, -10.0])
-def test_skin_leakage_follows_from_glass_leakage(rng, zero_deg):
-    *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
-    value, error = leakage(fit_polarizers(*data, GLASS), SKIN)
+def test_skin_leakage_follows_from_glass_leakage(zero_deg):
+    _, truth, fit = fitted(zero_deg)
+    value, error = leakage(fit, SKIN)
     pull = (value - truth["leak"]) / error
     assert np.mean(np.abs(pull) < 2) > 0.85
     assert np.median(error / truth["leak"]) < 0.05

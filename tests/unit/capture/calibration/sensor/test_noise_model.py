@@ -78,7 +78,7 @@ def sigmas(quantity, truth):
 def calibrations():
     bench = Bench(shape=(96, 128))
     return [
-        bench.calibrate(np.random.default_rng([7, seed]), levels=6, block=8) for seed in range(60)
+        bench.calibrate(np.random.default_rng([7, seed]), levels=6, block=8) for seed in range(36)
     ]
 
 
@@ -101,7 +101,7 @@ def outside_interval(count_inside, count, share=0.6827, false_alarm=1e-3):
 def test_stated_errors_cover_truth_in_68_percent(calibrations, name, truth):
     """Rationale: one standard error must hold 68 % of the truths.
 
-    Expected: 180 estimates (60 seeds x 3 colors) per quantity; false-alarm rate 1e-3 per quantity.
+    Expected: 108 estimates (36 seeds x 3 colors) per quantity; false-alarm rate 1e-3 per quantity.
     Colors share darks and flash jitter only in the nonlinearity, so that one color is judged there.
     """
     z = np.array([sigmas(getattr(c, name), truth) for c in calibrations])

@@ -59,12 +59,10 @@ def test_moved_face_differs_only_in_position(face, nearer):
 
 
 def test_moving_and_building_face_commute(face, nearer):
-    first, last = (
-        face.with_expression("smile").translate((0.0, 0.0, NEARER_MM)),
-        nearer.with_expression("smile"),
-    )
+    smile = face.with_expression("smile")
+    first, last = smile.translate((0.0, 0.0, NEARER_MM)), nearer.with_expression("smile")
     np.testing.assert_allclose(first.mesh.vertices_mm, last.mesh.vertices_mm, atol=1e-3)
-    way = last.mesh.vertices_mm - face.with_expression("smile").mesh.vertices_mm
+    way = last.mesh.vertices_mm - smile.mesh.vertices_mm
     np.testing.assert_allclose(way, np.broadcast_to([0, 0, NEARER_MM], way.shape), atol=1e-3)
     assert last.offset_mm == first.offset_mm == nearer.offset_mm
 

@@ -11,6 +11,7 @@ from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.mitsuba.variant import choose_renderer
+from rigsim.needs.sampled_patch import SampledPatch
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.gradient.resolution import SineRelief, make_sine_relief_scene
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
@@ -39,6 +40,24 @@ class Light:
 @pytest.fixture(scope="module")
 def rig():
     return load_rig("gradient").cropped(SIDE)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patches_sized_once():
+    """Compute the effects' sizes once for the scenes of a patch in the same light and camera."""
+    sized = {}
+    compute = SampledPatch.changes_over_noise
+
+    def look_up(window, white, noise, built):
+        light = window.sphere.intensity.tobytes(), window.view, window.lens
+        asked = id(window.patch), *light, white, noise, tuple(built.items())
+        if asked not in sized:  # the patch is kept, so that no other has its id
+            sized[asked] = window.patch, compute(window, white, noise, built)
+        return sized[asked][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SampledPatch, "changes_over_noise", look_up)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -236,15 +255,17 @@ def test_invalid_scene_requests_are_refused(rig, skin, scene):
         GradientScene(rig, "cube")
 
 
-def test_unaffordable_patches_name_the_fast_renderer(rig, skin):
+def test_unaffordable_patches_name_the_fast_renderer(rig, skin, monkeypatch):
     """What Mitsuba does not render falls back with the reason; it never differs silently."""
     smooth = dataclasses.replace(skin, alpha=np.full_like(skin.alpha, 0.01))
-    full = load_rig("gradient")
+    full, flat = load_rig("gradient"), GradientScene(rig, "flat")
+    effects = GradientScene(rig, skin).needs  # the same for all: the choice follows other facts
+    monkeypatch.setattr("rigsim.scenes.gradient.scene.select_gradient_effects", lambda *_: effects)
     for made, why in (
         (GradientScene(full, skin), "3.3e+08 shadow rays per state exceed 2.5e+07"),
         (GradientScene(rig, skin, sectors=16), "sectors: requested settings of the fast renderer"),
         (GradientScene(rig, smooth), "roughness 0.01 is below 0.02"),
-        (GradientScene(rig, "flat"), "closed forms render the target flat"),
+        (flat, "closed forms render the target flat"),
         (GradientScene(rig, skin, choice=choose_renderer("fast")), "requested"),
     ):
         assert (made.variant.renderer, made.variant.why) == ("fast", why)
