@@ -64,7 +64,9 @@ class RefinedScan:
 
     def scanned_mesh(self) -> TriangleMesh:
         """Return the repaired scan without the triangles that close holes."""
-        return self.coarse if self.hole_faces is None else self.coarse.select_faces(~self.hole_faces)
+        return (
+            self.coarse if self.hole_faces is None else self.coarse.select_faces(~self.hole_faces)
+        )
 
     def transform(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Apply a rigid motion ``rotation @ p + translation_mm`` to the surface."""
