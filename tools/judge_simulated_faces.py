@@ -24,7 +24,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial import cKDTree
 
 from model import skin_tone
-from rigsim.skin_patch.microrelief import SITE_NAMES, make_micro_skin
+from rigsim.skin_patch.microrelief import SITE_NAMES, SiteName, make_micro_skin
 from rigsim.subject import make_subject
 from rigsim.subject.face_regions import region_masks, to_mean_head
 from rigsim.subject.person import SimulatedSubject
@@ -128,9 +128,9 @@ def judge_colors(
     return np.array(far)
 
 
-def judge_slopes(site: str, seed: int) -> tuple[float, Floats]:
+def judge_slopes(site: SiteName, seed: int) -> tuple[float, Floats]:
     """Return the RMS slope of a patch, and the parts of its variance between `PERIODS_UM`."""
-    skin = make_micro_skin(site, seed=seed, size_mm=4.0)  # type: ignore[arg-type]
+    skin = make_micro_skin(site, seed=seed, size_mm=4.0)
     height = skin.height_um.astype(float)
     window = np.outer(*(np.hanning(n) for n in height.shape))
     power = np.abs(np.fft.fft2((height - height.mean()) * window)) ** 2
@@ -173,9 +173,10 @@ def main() -> int:
     print(f"site | RMS slope | over Beckmann | variance between {PERIODS_UM} um, %")
     for site in SITE_NAMES:
         found = [judge_slopes(site, seed) for seed in range(asked.seeds)]
-        rms, parts = (np.mean([one[k] for one in found], axis=0) for k in (0, 1))
+        rms = float(np.mean([slope for slope, _ in found]))
+        parts = np.mean([parts for _, parts in found], axis=0)
         nearest = float(np.clip(rms, *BECKMANN_RANGE))
-        missed |= abs(float(rms) / nearest - 1.0) > SLOPE_TOLERANCE
+        missed |= abs(rms / nearest - 1.0) > SLOPE_TOLERANCE
         shown = ", ".join(f"{100.0 * part:.0f}" for part in parts)
         print(f"{site} | {rms:.3f} | {rms / nearest:.2f} | {shown}")
     return int(missed)
