@@ -10,7 +10,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from model.checks import Checks
-from reconstruction.arrays import Float32Array, Float64Array, Int32Array, Int64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from reconstruction.scan.hole_patches import close_scan
 from reconstruction.scan.repair import (
     RepairReport,
     ScanMeshError,
@@ -49,6 +50,23 @@ class RefinedScan:
     """Counts of the repairs."""
     stderr_mm: Float32Array | None = None
     """Standard error across the surface at each point, shape (P,); None: not known."""
+    hole_stderr_mm: Float32Array | None = None
+    """Standard error across the surface of points in closed holes, 0 elsewhere, shape (P,); None:
+    all points are scanned."""
+    hole_faces: BoolArray | None = None
+    """Triangles of `coarse` that close holes, shape (F,); None: none."""
+
+    @property
+    def patch_stderr_mm(self) -> Float32Array:
+        """Return the standard error by closed holes at each point, shape (P,), mm."""
+        none = np.zeros(len(self.points_mm), np.float32)
+        return none if self.hole_stderr_mm is None else self.hole_stderr_mm
+
+    def scanned_mesh(self) -> TriangleMesh:
+        """Return the repaired scan without the triangles that close holes."""
+        return (
+            self.coarse if self.hole_faces is None else self.coarse.select_faces(~self.hole_faces)
+        )
 
     def transform(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Apply a rigid motion ``rotation @ p + translation_mm`` to the surface."""
@@ -93,7 +111,9 @@ def load_ply(data: bytes) -> TriangleMesh:
 
 
 def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
-    """Crop, repair, unwrap and refine a scan.
+    """Crop and repair a scan, close its holes, unwrap and refine it.
+
+    A scan with texture coordinates keeps its holes, as their texture is not known.
 
     Parameters
     ----------
@@ -115,9 +135,16 @@ def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> Refine
     """
     mesh = load_ply(scan) if isinstance(scan, bytes) else scan
     mesh, report = repair_mesh(crop(mesh, box_mm=FACE_BOX_MM))
-    if mesh.corner_uv is None:
-        mesh = unwrap_mesh(mesh)
-    return refine_mesh(mesh, points=points, report=report)
+    if mesh.corner_uv is not None:
+        return refine_mesh(mesh, points=points, report=report)
+    closed = close_scan(mesh)
+    refined = refine_mesh(
+        unwrap_mesh(closed.mesh), points=points, report=report, hole_stderr_mm=closed.stderr_mm
+    )
+    if not closed.rims_mm:
+        return replace(refined, hole_stderr_mm=None)
+    counts = {**report.counts, "holes closed by smooth patches": len(closed.rims_mm)}
+    return replace(refined, hole_faces=closed.hole_faces, report=RepairReport(counts))
 
 
 def unwrap_mesh(mesh: TriangleMesh, *, smoothings: int = UNWRAP_SMOOTHINGS) -> TriangleMesh:
@@ -169,11 +196,16 @@ def _smooth_vertices(mesh: TriangleMesh, count: int) -> Float64Array:
 
 
 def refine_mesh(
-    mesh: TriangleMesh, *, points: int, report: RepairReport | None = None
+    mesh: TriangleMesh,
+    *,
+    points: int,
+    report: RepairReport | None = None,
+    hole_stderr_mm: Float64Array | None = None,
 ) -> RefinedScan:
     """Refine a clean surface by Loop subdivision to about `points` points.
 
-    Texture coordinates are refined linearly: each half of an edge is half of it in the texture.
+    Texture coordinates are refined linearly: each half of an edge is half of it in the texture. So
+    are the standard errors of vertices in closed holes, shape (V,).
 
     References
     ----------
@@ -185,7 +217,11 @@ def refine_mesh(
     if mesh.corner_uv is None:
         raise ScanMeshError("mesh: got no texture coordinates, expected some; see unwrap_mesh")
     steps = max(round(float(np.log(points / len(mesh.vertices_mm)) / np.log(4.0))), 0)
-    fine = _split_chords(mesh)
+    fine = mesh
+    if hole_stderr_mm is not None:  # as a third coordinate of each corner
+        errors = hole_stderr_mm[mesh.faces][..., None]
+        fine = replace(mesh, corner_uv=np.concatenate([mesh.corner_uv, errors], axis=-1))
+    fine = _split_chords(fine)
     for _ in range(steps):
         uv = fine.corner_uv
         vertices, faces = subdivide_loop(fine.vertices_mm, fine.faces, iterations=1)
@@ -196,13 +232,18 @@ def refine_mesh(
             "refine: got different numbers of triangles and texture triangles, expected equal "
             "numbers; unwrap the mesh again"
         )
+    stderr = None
+    if hole_stderr_mm is not None:
+        stderr = np.zeros(len(fine.vertices_mm), np.float32)
+        stderr[fine.faces] = uv[..., 2]
     return RefinedScan(
         fine.vertices_mm.astype(np.float32),
         fine.normals(),
         fine.faces.astype(np.int32),
-        uv.astype(np.float32),
+        uv[..., :2].astype(np.float32),
         mesh,
         report or RepairReport(),
+        hole_stderr_mm=stderr,
     )
 
 
@@ -213,7 +254,7 @@ def _halved(uv: Float64Array | None) -> Float64Array | None:
     a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     rows = [a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca]
-    return np.stack(rows, axis=1).reshape(-1, 3, 2)
+    return np.stack(rows, axis=1).reshape(-1, 3, uv.shape[-1])
 
 
 def _split_chords(mesh: TriangleMesh) -> TriangleMesh:

@@ -129,13 +129,15 @@ def add_normal_errors(normals: PointValues, surface: RefinedScan, pixel_mm: floa
         Its triangles define the edges over which the normals' change is measured.
     pixel_mm
         Size of an image's pixel on the subject: scan, registration and cameras together position a
-        sample within about `POSITION_SIGMA_PX` of it, and within it normals are averaged.
+        sample within about `POSITION_SIGMA_PX` of it, and within it normals are averaged. In closed
+        holes, the error of the surface adds to this.
     """
     change = change_per_mm(
         normals.values, surface.points_mm, surface.faces, normals.valid, pixel_mm=pixel_mm
     )
     bend = np.linalg.norm(change, axis=1)  # rad/mm
-    spread = np.hypot(POSITION_SIGMA_PX * pixel_mm * bend, UNRESOLVED_RELIEF_RAD)
+    shift_mm = np.hypot(POSITION_SIGMA_PX * pixel_mm, surface.patch_stderr_mm)
+    spread = np.hypot(shift_mm * bend, UNRESOLVED_RELIEF_RAD)
     stderr = np.hypot(normals.stderr, spread[:, None])
     return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)
 
@@ -176,7 +178,8 @@ def add_albedo_errors(
     change = np.hypot(
         np.sqrt(1.0 - SHARED_DETAIL_FRACTION) * change, np.sqrt(SHARED_DETAIL_FRACTION) * typical
     )
-    stderr = np.hypot(r_d.stderr, UNRESOLVED_R_D_PX * pixel_mm * change)
+    blur_mm = np.hypot(UNRESOLVED_R_D_PX * pixel_mm, surface.patch_stderr_mm)
+    stderr = np.hypot(r_d.stderr, blur_mm[:, None] * change)
     relative = np.hypot(SHARED_R_D_ERROR, R_D_ERROR_PER_RAD * normals.stderr[:, :1])
     stderr = np.hypot(stderr, relative * np.abs(r_d.values))
     return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)

@@ -13,20 +13,24 @@ MEASURED_SUFFIX: Final = "_measured"
 """Suffix of maps of which normals are measured, not filled."""
 N_NEIGHBORS: Final = 12
 """Measured texels around a gap's texel whose normals give its error."""
-MAX_GAP_DISTANCE_MM: Final = 4.0
-"""Texels farther from the next measured one stay masked: nothing determines them."""
+MAX_GAP_DISTANCE_MM: Final = 12.0
+"""Texels farther from the next measured one stay masked: errors were not measured beyond."""
 SPREAD_FACTOR: Final = 0.46
 """Standard error of a filled normal over the spread of the measured normals around it.
 
 Set on nine simulated faces, see docs/validation/fusion.md."""
+BEND_RAD_PER_MM: Final = 0.012
+"""Standard error of a filled normal per mm to the next measured one: the surface bends on.
+
+Set on gaps drawn on four simulated heads, see docs/validation/fusion.md."""
 
 
 def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap | None]:
     """Fill the gaps of normals whose neighborhood is measured.
 
-    Masked texels have values that were interpolated over the texture. They become valid, with the
-    spread of the nearest measured normals times `SPREAD_FACTOR` as standard error, at least the
-    median standard error of these.
+    Masked texels have values that were interpolated over the texture. They become valid. Their
+    standard error is the spread of the nearest measured normals times `SPREAD_FACTOR` and the
+    distance to the nearest times `BEND_RAD_PER_MM`, at least the median error of these normals.
 
     Parameters
     ----------
@@ -60,7 +64,8 @@ def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap 
     errors = normals.stderr[known].reshape(len(tree.data), -1)[near]
     least = np.median(errors.max(axis=-1), axis=1)
     stderr = normals.stderr.copy()
-    found = np.maximum(SPREAD_FACTOR * spread, least).astype(stderr.dtype)
+    bent = np.hypot(SPREAD_FACTOR * spread, BEND_RAD_PER_MM * distance[:, 0])
+    found = np.maximum(bent, least).astype(stderr.dtype)
     stderr[gap] = found.reshape(-1, *([1] * (stderr.ndim - 2)))
     whole = known | filled
     what = f"{normals.description}, gaps filled from measured neighbors"

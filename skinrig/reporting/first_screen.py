@@ -13,6 +13,7 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.front_view import FrontView
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.evaluating import microrelief
+from skinrig.fusing.filled_normals import MEASURED_SUFFIX
 from skinrig.reporting import map_images, map_names, page
 from skinrig.reporting.sections import subsurface
 
@@ -80,9 +81,13 @@ class Candidate:
         elif truth is not None and other is not None and key.startswith("height_"):
             relief = microrelief.true_relief(found, truth, key.removeprefix("height_"))
             other = replace(other, values=relief)
-        labels = "captured" if re.fullmatch(KEYS_BY_QUANTITY[CAPTURED_IMAGE], key) else "estimate"
+        label = "captured" if re.fullmatch(KEYS_BY_QUANTITY[CAPTURED_IMAGE], key) else "estimate"
+        measured = found.maps.get(f"{key}{MEASURED_SUFFIX}")
+        if measured is not None and measured.mask.any():
+            filled = 1.0 - float(measured.values[measured.mask].mean())
+            label += f", {100.0 * filled:.1f} % filled"
         places = found.maps.get("position"), maps.get("position")
-        return Candidate(name, key, estimate, places[0], other, places[1], (labels, "ground truth"))
+        return Candidate(name, key, estimate, places[0], other, places[1], (label, "ground truth"))
 
 
 def draw_first_screen(

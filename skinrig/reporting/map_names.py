@@ -17,6 +17,7 @@ MAP_WORDS: Final = {
     "half_vector_normals": "half-vector normals",
     "lobe_residual": "residual of the basis BRDFs",
     "samples": "samples per point",
+    "hole_stderr": "standard error in closed holes",
     "gamut_distance": "distance from the gamut of skin",
     "translucency": "diffuse mean free path",
     "tsumura_melanin": "melanin, independent components",

@@ -10,6 +10,7 @@ from reconstruction.correspondence import landmark_table
 from reconstruction.scan import (
     closest_points,
     face_template,
+    hole_patches,
     surface_stiffness,
     template_pose,
     template_wrapping,
@@ -64,6 +65,38 @@ def test_rigid_motion_changes_no_area_bending_or_fold(seed):
         surface_stiffness.surface_stiffness(here).bending @ shift,
         atol=1e-9,
     )
+
+
+@given(SEEDS, st.floats(1.5, 3.0))
+@settings(max_examples=15, deadline=None)
+def test_hole_of_plane_is_closed_in_plane(seed, radius):
+    """In any pose; the patch has no error, as the rim's normals agree."""
+    flat = sheet(side_mm=80.0, cells=16)
+    points = flat.vertices_mm - flat.vertices_mm.mean(axis=0)
+    cell = np.sqrt(np.ptp(points[:, 0]) * np.ptp(points[:, 1])) / 16.0
+    away = np.linalg.norm(points[flat.faces].mean(axis=1), axis=1)
+    scan = TriangleMesh(points, flat.faces).select_faces(away > radius * cell)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    moved = TriangleMesh(scan.vertices_mm @ turn.T + 7.0, scan.faces)
+    closed = hole_patches.close_scan(moved)
+    (patch,) = hole_patches.find_patches(moved.vertices_mm, moved.faces)
+    assert closed.hole_faces.sum() == len(patch.faces)
+    np.testing.assert_allclose((closed.mesh.vertices_mm - 7.0) @ turn[:, 2], 0.0, atol=1e-6 * cell)
+    assert closed.stderr_mm.max() < 1e-3
+    area = np.linalg.norm(closed.mesh.face_vectors(), axis=1).sum() / 2.0
+    np.testing.assert_allclose(area, np.ptp(points[:, 0]) * np.ptp(points[:, 1]), rtol=1e-6)
+
+
+@given(SEEDS, st.floats(0.1, 10.0))
+@settings(max_examples=25, deadline=None)
+def test_patch_error_grows_away_from_bent_rim(seed, step_mm):
+    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    round_rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=-1)
+    tilt = np.random.default_rng(seed).uniform(0.1, 1.0)
+    normals = np.sin(tilt) * round_rim + np.array([0.0, 0.0, np.cos(tilt)])
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]) * step_mm
+    near, far = hole_patches.estimate_patch_error(points, round_rim, normals)
+    assert 0.0 < near < far
 
 
 @given(st.lists(st.tuples(*[st.floats(-1e6, 1e6)] * 3), min_size=1, max_size=5))

@@ -7,7 +7,7 @@ RECIPE = Recipe(
     stages.MAP_NAMES,
     stages.graph,
     stages.FILE_NAMES,
-    ("position",),
+    ("position", stages.HOLE_MAP),
     maps_of_rank=stages.map_names,
     # between those of 320 and of 1300 pixels, whose ratios differ
     typical_seconds={

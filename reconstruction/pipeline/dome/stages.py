@@ -49,10 +49,13 @@ from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 from reconstruction.tiles import MAX_WORKERS
 
-STAGE_REVISION = 8
+STAGE_REVISION = 9
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"
+HOLE_MAP: Final = "hole_stderr"
+"""Map of the standard error of the surface in closed holes of the scan."""
+HOLE_NOTE: Final = "standard error across the surface in closed holes of the scan; 0: scanned"
 MEMORY_BYTES: Final = 2**30
 """Sample tables above this size are stored in files, not in memory."""
 FACE_AREA_MM2: Final = 60_000.0
@@ -63,7 +66,7 @@ TEXTURE_LIMITS: Final = (128, 2048)
 
 def map_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps of a dome session."""
-    first = ("position", "half_vector_normals", "normals", "r_d")
+    first = ("position", HOLE_MAP, "half_vector_normals", "normals", "r_d")
     last = "lobe_residual", "normals_refined", "samples"
     return (*first, *weight_names(rank), *last, *tone.MAP_NAMES)
 
@@ -99,7 +102,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     spectra = {"camera": view.spectral_sensitivity, "illuminant": light.illuminant}
     return [
         stage("surface", "", "surface", partial(_surface, inputs, dome, scanner)),
-        stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
+        stage("texture", "surface", f"texture position {HOLE_MAP} {MESH_FILE}", _texture),
         stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
         stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, inputs, dome)),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
@@ -142,7 +145,7 @@ def _dome(inputs: Inputs) -> CalibratedDome:
 
 
 def _surface(inputs: Inputs, dome: CalibratedDome, scanner: ScannerPoses | None) -> RefinedScan:
-    """Clean and refine the scan, and register it to the dome."""
+    """Clean the scan, close its holes, refine it, and register it to the dome."""
     session = inputs.session
     if scanner is None and inputs.scan is None and SCAN_FILE not in session.attachments():
         raise InputsError(
@@ -160,7 +163,7 @@ def _surface(inputs: Inputs, dome: CalibratedDome, scanner: ScannerPoses | None)
     else:
         mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
     scan = scan_mesh.prepare_scan(mesh, points=points)
-    fit = register_mesh(dome, scan.coarse)
+    fit = register_mesh(dome, scan.scanned_mesh())
     # a calibrated scanner places the face better than the images do, unless the head has moved
     # by more than one of their pixels
     shift_mm = np.linalg.norm(fit.move(scan.points_mm) - scan.points_mm, axis=1)
@@ -179,7 +182,7 @@ def _surface(inputs: Inputs, dome: CalibratedDome, scanner: ScannerPoses | None)
     if decoded is not None:
         _, nearest = cKDTree(decoded.mesh.vertices_mm).query(scan.points_mm)
         moved_mm = 0.0 if placed else float(np.sqrt(np.mean(np.square(fit.stderr[3:]))))
-        stderr = np.hypot(decoded.stderr_mm[nearest], moved_mm)
+        stderr = np.hypot(np.hypot(decoded.stderr_mm[nearest], moved_mm), scan.patch_stderr_mm)
         scan = replace(scan, stderr_mm=stderr.astype(np.float32))
     return scan if placed else scan.transform(fit.rotation, fit.translation_mm)
 
@@ -203,8 +206,15 @@ def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     points = surface.points_mm
     errors = surface.stderr_mm
     stderr = None if errors is None else np.repeat(errors[:, None], 3, axis=1)
-    position = texture.map(points, stderr, np.ones(len(points), bool), "mm", "rig frame")
-    return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
+    known = np.ones(len(points), bool)
+    position = texture.map(points, stderr, known, "mm", "rig frame")
+    patch = texture.map(surface.patch_stderr_mm, None, known, "mm", HOLE_NOTE)
+    return {
+        "texture": texture,
+        "position": position,
+        HOLE_MAP: patch,
+        MESH_FILE: texture.wavefront(),
+    }
 
 
 def _motion(inputs: Inputs, dome: CalibratedDome, surface: RefinedScan) -> DomeHeadMotion | None:

@@ -78,6 +78,29 @@ def test_misplacement_error_is_curvature_times_misplacement():
         np.testing.assert_allclose(found.stderr, expected, rtol=0.01)
 
 
+def test_errors_in_closed_holes_include_surface_error():
+    """On a ball of radius R a patch off by s turns normals by s / R; R_d changes by its slope."""
+    surface = sheet(ball(60.0), step=1.0)
+    count = len(surface.points_mm)
+    holes = np.where(np.arange(count) < count // 2, 0.8, 0.0).astype(np.float32)
+    patched = dataclasses.replace(surface, hole_stderr_mm=holes)
+    normals = plain(surface, 0.001)
+    before, after = (surface_errors.add_normal_errors(normals, s, 2.0) for s in (surface, patched))
+    added = np.sqrt(after.stderr**2 - before.stderr**2)[:, 0]
+    np.testing.assert_allclose(added[holes > 0.0], 0.8 / 60.0, rtol=0.02)
+    assert not added[holes == 0.0].any()
+    r_d = PointValues(
+        0.3 + 0.01 * surface.points_mm[:, :1] * np.ones((1, 3)),
+        1e-5 + 0.0 * normals.values,
+        normals.valid,
+    )
+    before, after = (
+        surface_errors.add_albedo_errors(r_d, normals, s, 2.0).stderr for s in (surface, patched)
+    )
+    assert (after[holes > 0.0] > before[holes > 0.0]).all()
+    np.testing.assert_array_equal(after[holes == 0.0], before[holes == 0.0])
+
+
 def test_normal_errors_without_neighbors_stay_finite():
     surface = sheet(ball(60.0))
     normals = plain(surface)

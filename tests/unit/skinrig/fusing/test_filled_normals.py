@@ -6,7 +6,7 @@ import pytest
 from model.skin import SkinMap
 from model.vectors import unit_vectors
 from reconstruction.surface.texture_fill import push_pull
-from skinrig.fusing.filled_normals import MAX_GAP_DISTANCE_MM, fill_normals
+from skinrig.fusing.filled_normals import BEND_RAD_PER_MM, MAX_GAP_DISTANCE_MM, fill_normals
 
 SIDE = 60
 """Texels of 1 mm along a side."""
@@ -30,7 +30,7 @@ def disc(radius_mm):
 
 
 def test_fill_normals_of_gap_states_its_error():
-    gap = disc(3.5)
+    gap = disc(4.5)
     normals, position, true = face(gap)
     found, measured = fill_normals(normals, position)
     assert found.mask.all()
@@ -43,10 +43,20 @@ def test_fill_normals_of_gap_states_its_error():
 
 
 def test_fill_normals_far_from_measured_stay_masked():
-    normals, position, _ = face(disc(12.0))
+    normals, position, _ = face(disc(20.0))
     found, _ = fill_normals(normals, position)
-    assert not found.mask[disc(11.0 - MAX_GAP_DISTANCE_MM)].any()
+    assert not found.mask[disc(19.0 - MAX_GAP_DISTANCE_MM)].any()
     assert found.mask[~disc(10.0)].all()
+
+
+def test_filled_normal_error_grows_with_distance():
+    gap = disc(8.0)
+    normals, position, _ = face(gap)
+    found, _ = fill_normals(normals, position)
+    at = np.hypot(*np.meshgrid(*[np.arange(SIDE) - SIDE / 2] * 2))
+    deep, rim = (found.stderr[..., 0][gap & ring] for ring in (at < 2.0, at > 6.0))
+    assert np.median(deep) > 1.2 * np.median(rim)
+    assert (found.stderr[gap][:, 0] >= BEND_RAD_PER_MM * (8.0 - at[gap]) * 0.9).all()
 
 
 def test_fill_normals_without_near_neighbors_changes_nothing():

@@ -58,9 +58,9 @@ def test_fill_skin_of_gaps_states_its_error():
 
 
 def test_fill_skin_far_from_measured_stays_masked():
-    maps, _ = skin(disc(12.0))
+    maps, _ = skin(disc(20.0))
     found = fill_skin(maps, points())["r_d"]
-    assert not found.mask[disc(11.0 - MAX_GAP_DISTANCE_MM)].any()
+    assert not found.mask[disc(19.0 - MAX_GAP_DISTANCE_MM)].any()
     assert found.mask[~disc(10.0)].all()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from reconstruction.scan import hole_patches
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import hole_patches as patch_charts
 
@@ -41,16 +42,16 @@ def scan():
 
 
 def test_small_holes_close_and_the_rim_stays(scan):
-    found = patch_charts.find_patches(scan.vertices_mm, scan.faces)
+    found = hole_patches.find_patches(scan.vertices_mm, scan.faces)
     assert [len(one.rim) for one in found] == sorted([len(one.rim) for one in found], reverse=True)
     assert len(found) == 2
     closed = patch_charts.close_holes(scan)
-    edges = patch_charts._loops(_welded(closed.mesh))
+    edges = hole_patches._loops(_welded(closed.mesh))
     assert len(edges) == 1
     rim = np.linalg.norm(closed.mesh.vertices_mm[edges[0]][:, :2], axis=1)
     assert rim.min() > 0.8 * RADIUS_MM * np.sin(0.45 * np.pi)
     whole = _dome(())
-    assert patch_charts.find_patches(whole.vertices_mm, whole.faces) == []
+    assert hole_patches.find_patches(whole.vertices_mm, whole.faces) == []
 
 
 def _welded(mesh):
@@ -60,7 +61,7 @@ def _welded(mesh):
 
 def test_a_patch_bends_on_as_the_surface_does(scan):
     """A thin plate over a sphere: the stairs of the rim, 0.1 mm high, are all that it misses."""
-    for patch in patch_charts.find_patches(scan.vertices_mm, scan.faces):
+    for patch in hole_patches.find_patches(scan.vertices_mm, scan.faces):
         off = np.abs(np.linalg.norm(patch.inner_mm, axis=1) - RADIUS_MM)
         rim = scan.vertices_mm[patch.rim].astype(np.float64)
         lid = patch.interpolate_from_rim(rim)[len(rim) :]

@@ -115,6 +115,22 @@ def test_estimate_and_ground_truth_share_one_color_bar(rng):
     assert "volume fraction</span>" in html
 
 
+def test_first_screen_states_filled_part_of_map(rng):
+    normals = map_of("normals_refined", rng)
+    of_texel = np.ones(SHAPE)
+    rows, columns = np.nonzero(normals.mask)
+    filled = len(rows) // 4
+    of_texel[rows[:filled], columns[:filled]] = 0.0
+    maps = {
+        "normals_refined": normals,
+        "normals_refined_measured": SkinMap(of_texel, "1", None, normals.mask),
+    }
+    (panel,), html = panels_of({"double": SkinAppearance(maps, "simulated")})
+    share = f"estimate, {100.0 * filled / len(rows):.1f} % filled"
+    assert panel.images[0].title == share
+    assert share in html
+
+
 def test_collection_takes_each_quantity_from_the_best_set(rng):
     sets = {
         "a-without-truth": appearance_of(("melanin",), rng),
