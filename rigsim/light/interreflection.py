@@ -240,23 +240,6 @@ class InterreflectionSettings:
     """Fraction of the first bounce below which further bounces are omitted."""
 
 
-def coarse_skin(
-    exchange: Interreflection, skin: ObservedSkin, r_d: Float32Array, reflectance: Float32Array
-) -> Float32Array:
-    """Return a face's skin on patches, arguments as for `InterreflectionColor`.
-
-    Shape (P, 10): coverage, melanin, blood, thickness, covering over reflectance (3), and r_d (3).
-    """
-    subject = skin.subject
-    covered = subject.atlas.covered.astype(np.float32)
-    factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-    fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
-    layers = np.dstack([covered, *fractions, factor, r_d])
-    coarse = exchange.coarsen(np.asarray(layers * covered[..., None], np.float32))
-    coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
-    return coarse
-
-
 class InterreflectionColor:
     """Interreflection on one face in one state, in one camera's channels.
 
@@ -270,8 +253,6 @@ class InterreflectionColor:
         Factor of the diffuse term per channel, including the skin's covering, shape (N, N, 3).
     reflectance
         White-balanced reflectance of the skin per channel, shape (N, N, 3).
-    coarse
-        Result of `coarse_skin`; None computes it.
     """
 
     def __init__(
@@ -280,12 +261,17 @@ class InterreflectionColor:
         skin: ObservedSkin,
         r_d: Float32Array,
         reflectance: Float32Array,
-        coarse: Float32Array | None = None,
     ) -> None:
         self._bounce, self._min_bounce_fraction = bounces.exchange, bounces.min_bounce_fraction
-        if coarse is None:
-            coarse = coarse_skin(self._bounce, skin, r_d, reflectance)
-        self._r_d = np.ascontiguousarray(coarse[:, 7:])
+        subject = skin.subject
+        covered = subject.atlas.covered.astype(np.float32)
+        factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
+        fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
+        layers = np.dstack([covered, *fractions, factor, r_d])
+        coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
+        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
+        self.r_d = np.ascontiguousarray(coarse[:, 7:])
+        """Factor of the diffuse term of each patch, shape (P, 3)."""
         self._weights: Float32Array | None = None
         if bounces.spectral:
             weights = skin.band_weights(bounces.step)
@@ -294,8 +280,9 @@ class InterreflectionColor:
             thickness = np.clip(coarse[:, 3], ratio.min(), ratio.max())
             spectra = skin.spectra(coarse[:, 1], coarse[:, 2], thickness)[:, :: bounces.step]
             cover = coarse[:, 4:7].mean(axis=1, keepdims=True)
-            self._spectrum = np.asarray(spectra * cover, np.float32)
-            self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
+            self.spectrum = np.asarray(spectra * cover, np.float32)
+            """Spectral factor of each patch by the settings' wavelengths, shape (P, W)."""
+            self._channel = np.maximum(self.spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)
 
     def indirect_irradiance(self, direct: Float32Array) -> Float32Array:
@@ -314,16 +301,16 @@ class InterreflectionColor:
         """
         if self._weights is None:
             return self._bounce.indirect_irradiance(
-                direct, self._r_d, min_bounce_fraction=self._min_bounce_fraction
+                direct, self.r_d, min_bounce_fraction=self._min_bounce_fraction
             )
         each = self._bounce.indirect_irradiance(
-            direct, self._spectrum, min_bounce_fraction=self._min_bounce_fraction
+            direct, self.spectrum, min_bounce_fraction=self._min_bounce_fraction
         )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
         # The last reflection is included per wavelength and divided out per channel, so that the
         # caller's product with the channel's reflectance restores it.
-        out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
+        out[covered] = ((each[covered] * self.spectrum) @ self._weights) / self._channel
         return out
 
     def on_texture(self, direct: Float32Array, size: int) -> Float32Array:

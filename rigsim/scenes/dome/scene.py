@@ -44,7 +44,6 @@ from rigsim.mitsuba.image_hits import AddedLight
 from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.dome import min_noise, sample_led_light, select_dome_effects
-from rigsim.needs.effect_sizes import coarse_exchange
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
@@ -52,7 +51,7 @@ from rigsim.render import Caster
 from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome.images import LightImages
 from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, normalize
-from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
+from rigsim.scenes.exposing import FaceGeometry, FaceScene, SceneError, full_power_duration_s
 from rigsim.sensor import apply_cfa
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -134,8 +133,8 @@ class DomeScene(FaceScene):
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
         noise = min_noise([PixelNoise.of(sensor) for sensor in self._sensors.values()])
-        exchange = coarse_exchange(self._caster)
-        scenery = self._scenery(rig.views[0], self._caster, exchange, noise, effects)
+        self._geometry = FaceGeometry(self._caster)
+        scenery = self._scenery(rig.views[0], self._geometry, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
         sampled = sample_led_light(rig, self.subject, self._caster)
         seen = (scenery, white, sampled, movement, motion)
@@ -148,7 +147,7 @@ class DomeScene(FaceScene):
         self._glow: DomeSubsurfaceRadiance | None = None
         if isinstance(self.subject, SimulatedSubject):
             if self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT):
-                self._relief = ReliefShadow(self.subject)
+                self._relief = self._geometry.relief(self.subject)
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
         how = CameraSettings(subpixels, self._illuminant, self.optics)
