@@ -78,8 +78,9 @@ class SampledLight:
 
     covered: BoolArray
     """Texels with skin, shape (n, n)."""
-    visible: BoolArray
-    """Those that face a camera, shape (n, n)."""
+    facing: Float32Array
+    """Largest cosine between the mesh's normal and a camera that sees the texel, shape (n, n); 0:
+    no camera sees it."""
     irradiance: Float32Array
     """Irradiance over that of a white plate, with shadows of the mesh, shape (K, n, n)."""
     highlight: Float32Array
@@ -92,6 +93,11 @@ class SampledLight:
     """Lamps of each image."""
     part: tuple[slice, slice]
     """Sampled rows and columns of the face's texture."""
+
+    @property
+    def visible(self) -> BoolArray:
+        """Texels that a camera sees, shape (n, n)."""
+        return self.facing > 0.0
 
     def neighbors(self) -> Iterator[tuple[TexelIndex, TexelIndex]]:
         """Iterate over pairs of index arrays of neighboring texels: along u, and along v."""
@@ -142,6 +148,10 @@ def sample_light(
     to_cameras = np.asarray(cameras_mm, np.float32)[:, None] - position
     to_cameras /= np.linalg.norm(to_cameras, axis=-1, keepdims=True)
     cosines = np.einsum("vij,ij->vi", to_cameras, mesh_normal)
+    # a camera sees the points that it would light
+    eyes = [SampledLamp((float(x), float(y), float(z)), 0.0, 1.0) for x, y, z in cameras_mm]
+    shown = visible_fractions(caster, position, mesh_normal, eyes) > 0.0
+    shown &= cosines > MIN_VIEW_COSINE
     light, shine = (np.zeros((len(images), len(where)), np.float32) for _ in range(2))
     each = [(k, lamp) for k, lamps in enumerate(images) for lamp in lamps]
     parts = visible_fractions(caster, position, mesh_normal, [lamp for _, lamp in each])
@@ -158,7 +168,7 @@ def sample_light(
 
     return SampledLight(
         covered,
-        fill((cosines > MIN_VIEW_COSINE).any(axis=0)) > 0.0,
+        fill(np.where(shown, cosines, 0.0).max(axis=0)),
         fill(light),
         fill(shine),
         fill(cosines[0]),
