@@ -54,11 +54,15 @@ is at most a few thousand times the noise, of which a tenth counts."""
 MAX_REMAINING_NOISE_RATIO = 0.05
 """Limit of the remaining bounces, relative to the noise."""
 
-BOUNCE_MARGIN = 1.2
+BOUNCE_MARGIN = 1.3
+SPECTRAL_MARGIN = 1.65
 STEP_MARGIN = 1.5
+"""Factors on the first bounce, its color and its wavelengths, for parts of patches; set on 4 scenes
+of the flash rig and under grazing light."""
+
 LATERAL_MARGIN = 0.6
 LENS_MARGIN = 0.6
-"""Factors on the sizes of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
+"""Factors on steps of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,7 +182,7 @@ def interreflection_effects(
     exact = found.by_wavelength()
     spectral = decide_effect(
         SPECTRAL_EFFECT,
-        BOUNCE_MARGIN * found.over_noise(exact, found.by_channel),
+        SPECTRAL_MARGIN * found.over_noise(exact, found.by_channel),
         effects.spectral,
         switch="spectral",
         reason="a channel's mean of squares differs from the square of its mean",

@@ -14,6 +14,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
@@ -319,9 +320,12 @@ class SampledBounces:
 
     def over_noise(self, came: FloatArray, other: FloatArray | float = 0.0) -> float:
         """Return the largest change of a pixel over its noise between two bounces, (P, 3) each."""
-        k, direct = self._worst
+        k, _ = self._worst
         unit = self.white[k] * self._patch_reflectance
-        sigma = self.noise.sigma(unit * (direct[:, None] + self.by_channel))
+        # pixels are smaller than patches: the darkest neighbor has the least noise
+        bright = np.where(self.light.covered, self.light.irradiance[k], np.float32(np.inf))
+        darkest = self._on_patches(minimum_filter(bright, size=3, mode="nearest"))
+        sigma = self.noise.sigma(unit * (darkest[:, None] + self.by_channel))
         change = np.abs(unit * (came - other)) / sigma
         return float(change[self._is_visible].max(initial=0.0))
 
