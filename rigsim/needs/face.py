@@ -21,12 +21,8 @@ from rigsim.needs.effects import (
     SceneEffects,
     decide_effect,
 )
-from rigsim.needs.sampled_light import (
-    LitFace,
-    SampledBounces,
-    blur_over_noise,
-    scattering_over_noise,
-)
+from rigsim.needs.sampled_bounces import SampledBounces
+from rigsim.needs.sampled_light import LitFace, blur_over_noise, scattering_over_noise
 from rigsim.needs.sampled_relief import relief_shadows_over_noise
 from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render import Caster

@@ -100,8 +100,8 @@ def _changes(
         part[row, column].reshape(-1, 3)
         for part in (atlas.position_mm, atlas.normal, subject.normal)
     )
-    uv = np.stack([(column + 0.5) / size, 1.0 - (row + 0.5) / size], axis=-1)
-    uv = uv.reshape(-1, 2).astype(np.float32)
+    places = np.stack([(column + 0.5) / size, 1.0 - (row + 0.5) / size], axis=-1)
+    uv = places.reshape(-1, 2).astype(np.float32)
     seen = np.ones((len(lamps), 1), np.float32)
     if caster is not None:
         seen = visible_fractions(caster, position, mesh_normal, lamps)
