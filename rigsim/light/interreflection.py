@@ -45,8 +45,6 @@ MIN_TRANSFER: Final = 1e-6
 """Exchange of two patches below which it is omitted: a fifth of all pairs of a face, which carry
 0.1 % of the exchanged light."""
 
-PAIRS_PER_BLOCK: Final = 1 << 21
-
 
 class Interreflection:
     """Light exchange between the patches of one face.
@@ -151,56 +149,74 @@ def _texel_area(atlas: Atlas) -> Float32Array:
 def _exchange(
     caster: Caster, point: Float32Array, normal: Float32Array, area: Float32Array
 ) -> sparse.csr_array:
-    count = len(point)
-    rows, columns, values = [], [], []
-    step = max(1, PAIRS_PER_BLOCK // count)
-    for first in range(0, count, step):
-        block = np.arange(first, min(first + step, count))
-        strength = np.zeros((len(block), count - first), np.float32)
-        _pair_transfer(point, normal, area, first, math.pi * MIN_TRANSFER, strength)
-        i, j = np.nonzero(strength)
-        start = point[block[i]] + np.float32(RAY_OFFSET_MM) * normal[block[i]]
-        way = point[first + j] + np.float32(RAY_OFFSET_MM) * normal[first + j] - start
-        length = np.linalg.norm(way, axis=-1)
-        way /= length[:, None]
-        free = ~caster.is_blocked(start, way, 0.999 * length)
-        i, j = i[free], j[free]
-        share = strength[i, j]
-        # both directions between two patches share one visibility ray
-        for here, there in ((block[i], first + j), (first + j, block[i])):
-            # A distant patch of area A receives f = cos cos T T A / (pi d^2). A near patch is
-            # not a point: f / (1 + f) keeps its fraction below 1.
-            values.append(share * area[there] / (math.pi + share * area[there]))
-            rows.append(here)
-            columns.append(there)
-    shape = (count, count)
-    pairs = (np.concatenate(rows), np.concatenate(columns))
-    return sparse.csr_array((np.concatenate(values), pairs), shape=shape)
+    patches, least = (point, normal, area), math.pi * MIN_TRANSFER
+    count = np.zeros(len(point), np.int64)
+    _count_pairs(*patches, least, count)
+    ends = np.cumsum(count)
+    pairs = int(ends[-1]) if len(ends) else 0
+    here, there = np.empty(pairs, np.int32), np.empty(pairs, np.int32)
+    strength = np.empty(pairs, np.float32)
+    _fill_pairs(*patches, least, ends - count, here, there, strength)
+    raised = point + np.float32(RAY_OFFSET_MM) * normal
+    start = raised[here]
+    way = raised[there] - start
+    length = np.sqrt(np.einsum("ij,ij->i", way, way))
+    way /= length[:, None]
+    # both directions between two patches share one visibility ray
+    free = ~caster.is_blocked(start, way, np.float32(0.999) * length)
+    here, there, strength = here[free], there[free], strength[free]
+    # A distant patch of area A receives f = cos cos T T A / (pi d^2). A near patch is not a point:
+    # f / (1 + f) keeps its fraction below 1.
+    came, gone = strength * area[there], strength * area[here]
+    values = np.concatenate([came / (math.pi + came), gone / (math.pi + gone)])
+    places = np.concatenate([here, there]), np.concatenate([there, here])
+    return sparse.csr_array((values, places), shape=(len(point), len(point)))
 
 
-@njit(parallel=True, cache=True)
-def _pair_transfer(point, normal, area, first, least, out):  # type: ignore[no-untyped-def]
-    """Write cos cos T T / d^2 for mutually facing pairs, one direction of each pair.
+@njit(inline="always")
+def _facing(point, normal, area, i, j, least):  # type: ignore[no-untyped-def]
+    """Return both cosines and the squared distance of two patches; cosines of 0 omit the pair.
 
     Pairs that exchange less than ``least``, over pi, are omitted.
     """
-    for n in prange(out.shape[0]):
-        i = first + n
-        for j in range(i + 1, first + out.shape[1]):
-            x = float(point[j, 0]) - point[i, 0]
-            y = float(point[j, 1]) - point[i, 1]
-            z = float(point[j, 2]) - point[i, 2]
-            here = x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]
-            there = -(x * normal[j, 0] + y * normal[j, 1] + z * normal[j, 2])
-            if here <= 0.0 or there <= 0.0:
-                continue
-            squared = x * x + y * y + z * z
-            length = math.sqrt(squared)
-            here, there = min(here / length, 1.0), min(there / length, 1.0)
-            largest = max(area[i], area[j]) / squared * here * there
-            if largest < least:  # the boundary transmits less than all
-                continue
-            out[n, j - first] = here * there * transmittance(here) * transmittance(there) / squared
+    x = float(point[j, 0]) - point[i, 0]
+    y = float(point[j, 1]) - point[i, 1]
+    z = float(point[j, 2]) - point[i, 2]
+    here = x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]
+    there = -(x * normal[j, 0] + y * normal[j, 1] + z * normal[j, 2])
+    squared = x * x + y * y + z * z
+    if here <= 0.0 or there <= 0.0:
+        return 0.0, 0.0, squared
+    # the boundary transmits less than all
+    if max(area[i], area[j]) * here * there < least * squared * squared:
+        return 0.0, 0.0, squared
+    length = math.sqrt(squared)
+    return min(here / length, 1.0), min(there / length, 1.0), squared
+
+
+@njit(parallel=True, cache=True)
+def _count_pairs(point, normal, area, least, out):  # type: ignore[no-untyped-def]
+    """Count the later patches with which each patch exchanges light, as if none were hidden."""
+    patches = point.shape[0]
+    for task in prange(patches):
+        i = task // 2 if task % 2 == 0 else patches - 1 - task // 2  # early ones have more pairs
+        for j in range(i + 1, patches):
+            out[i] += _facing(point, normal, area, i, j, least)[0] > 0.0
+
+
+@njit(parallel=True, cache=True)
+def _fill_pairs(point, normal, area, least, start, here, there, strength):  # type: ignore[no-untyped-def]
+    """Write these pairs, and cos cos T T / d^2 of each."""
+    patches = point.shape[0]
+    for task in prange(patches):
+        i = task // 2 if task % 2 == 0 else patches - 1 - task // 2
+        at = start[i]
+        for j in range(i + 1, patches):
+            out, back, squared = _facing(point, normal, area, i, j, least)
+            if out > 0.0:
+                here[at], there[at] = i, j
+                strength[at] = out * back * transmittance(out) * transmittance(back) / squared
+                at += 1
 
 
 WAVELENGTH_STEPS: Final = (5, 3, 2)
@@ -224,23 +240,6 @@ class InterreflectionSettings:
     """Fraction of the first bounce below which further bounces are omitted."""
 
 
-def coarse_skin(
-    exchange: Interreflection, skin: ObservedSkin, r_d: Float32Array, reflectance: Float32Array
-) -> Float32Array:
-    """Return a face's skin on patches, arguments as for `InterreflectionColor`.
-
-    Shape (P, 10): coverage, melanin, blood, thickness, covering over reflectance (3), and r_d (3).
-    """
-    subject = skin.subject
-    covered = subject.atlas.covered.astype(np.float32)
-    factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-    fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
-    layers = np.dstack([covered, *fractions, factor, r_d])
-    coarse = exchange.coarsen(np.asarray(layers * covered[..., None], np.float32))
-    coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
-    return coarse
-
-
 class InterreflectionColor:
     """Interreflection on one face in one state, in one camera's channels.
 
@@ -254,8 +253,6 @@ class InterreflectionColor:
         Factor of the diffuse term per channel, including the skin's covering, shape (N, N, 3).
     reflectance
         White-balanced reflectance of the skin per channel, shape (N, N, 3).
-    coarse
-        Result of `coarse_skin`; None computes it.
     """
 
     def __init__(
@@ -264,12 +261,17 @@ class InterreflectionColor:
         skin: ObservedSkin,
         r_d: Float32Array,
         reflectance: Float32Array,
-        coarse: Float32Array | None = None,
     ) -> None:
         self._bounce, self._min_bounce_fraction = bounces.exchange, bounces.min_bounce_fraction
-        if coarse is None:
-            coarse = coarse_skin(self._bounce, skin, r_d, reflectance)
-        self._r_d = np.ascontiguousarray(coarse[:, 7:])
+        subject = skin.subject
+        covered = subject.atlas.covered.astype(np.float32)
+        factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
+        fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
+        layers = np.dstack([covered, *fractions, factor, r_d])
+        coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
+        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
+        self.r_d = np.ascontiguousarray(coarse[:, 7:])
+        """Factor of the diffuse term of each patch, shape (P, 3)."""
         self._weights: Float32Array | None = None
         if bounces.spectral:
             weights = skin.band_weights(bounces.step)
@@ -278,8 +280,9 @@ class InterreflectionColor:
             thickness = np.clip(coarse[:, 3], ratio.min(), ratio.max())
             spectra = skin.spectra(coarse[:, 1], coarse[:, 2], thickness)[:, :: bounces.step]
             cover = coarse[:, 4:7].mean(axis=1, keepdims=True)
-            self._spectrum = np.asarray(spectra * cover, np.float32)
-            self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
+            self.spectrum = np.asarray(spectra * cover, np.float32)
+            """Spectral factor of each patch by the settings' wavelengths, shape (P, W)."""
+            self._channel = np.maximum(self.spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)
 
     def indirect_irradiance(self, direct: Float32Array) -> Float32Array:
@@ -298,16 +301,16 @@ class InterreflectionColor:
         """
         if self._weights is None:
             return self._bounce.indirect_irradiance(
-                direct, self._r_d, min_bounce_fraction=self._min_bounce_fraction
+                direct, self.r_d, min_bounce_fraction=self._min_bounce_fraction
             )
         each = self._bounce.indirect_irradiance(
-            direct, self._spectrum, min_bounce_fraction=self._min_bounce_fraction
+            direct, self.spectrum, min_bounce_fraction=self._min_bounce_fraction
         )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
         # The last reflection is included per wavelength and divided out per channel, so that the
         # caller's product with the channel's reflectance restores it.
-        out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
+        out[covered] = ((each[covered] * self.spectrum) @ self._weights) / self._channel
         return out
 
     def on_texture(self, direct: Float32Array, size: int) -> Float32Array:

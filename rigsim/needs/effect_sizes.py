@@ -11,11 +11,8 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float64Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.light.interreflection import Interreflection
+from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.render import Caster
-
-EXCHANGE_PATCHES = 32
-"""Texels along one side of the coarse texture on which exchange between skin is estimated."""
 
 
 def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Float64Array:
@@ -62,15 +59,15 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
     return np.asarray(weight @ mean, np.float64)
 
 
-def coarse_exchange(caster: Caster) -> Interreflection | None:
-    """Return the exchange of light between coarse patches of a surface; None: it is flat.
+def exchange_unless_flat(caster: Caster) -> Interreflection | None:
+    """Return the exchange of light between the patches of a surface; None: it is flat.
 
     Parameters
     ----------
     caster
         The mesh; its texture coordinates must not overlap.
     """
-    return None if is_flat(caster.mesh) else Interreflection(caster, patches=EXCHANGE_PATCHES)
+    return None if is_flat(caster.mesh) else interreflection_for(caster)
 
 
 def max_exchange_fraction(exchange: Interreflection | None) -> float:
@@ -79,7 +76,7 @@ def max_exchange_fraction(exchange: Interreflection | None) -> float:
     Parameters
     ----------
     exchange
-        Exchange between its patches, see `coarse_exchange`.
+        Exchange between its patches, see `exchange_unless_flat`.
 
     Returns
     -------

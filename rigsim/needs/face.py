@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from capture.rig import Rig, View
-from rigsim.arrays import Float64Array, FloatArray
+from rigsim.arrays import FloatArray
 from rigsim.light.interreflection import WAVELENGTH_STEPS, Interreflection
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.relief_shadow import ReliefShadow
@@ -21,14 +21,8 @@ from rigsim.needs.effects import (
     SceneEffects,
     decide_effect,
 )
-from rigsim.needs.sampled_light import (
-    BOUNCE_CANDIDATES,
-    EXACT_BOUNCE_FRACTION,
-    LitFace,
-    SampledBounces,
-    blur_over_noise,
-    scattering_over_noise,
-)
+from rigsim.needs.sampled_bounces import SampledBounces
+from rigsim.needs.sampled_light import LitFace, blur_over_noise, scattering_over_noise
 from rigsim.needs.sampled_relief import relief_shadows_over_noise
 from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render import Caster
@@ -48,9 +42,6 @@ RELIEF_EFFECT = "relief of the skin"
 PIGMENT_EFFECT = "pattern of pigment"
 RELIEF_SHADOW_EFFECT = "shadows of relief"
 
-RULE_DIRECTIONS = 12
-"""Number of directions with horizons of the relief, for the size of its shadows."""
-
 MIN_PIGMENT_CONTRAST = 1e-5
 MIN_RELIEF_TILT_DEG = 1e-3
 """Relative change of reflectance, and tilt of normals, below every sensor's resolution: full scale
@@ -59,11 +50,15 @@ is at most a few thousand times the noise, of which a tenth counts."""
 MAX_REMAINING_NOISE_RATIO = 0.05
 """Limit of the remaining bounces, relative to the noise."""
 
-BOUNCE_MARGIN = 2.0
-STEP_MARGIN = 4.0
+BOUNCE_MARGIN = 1.3
+SPECTRAL_MARGIN = 1.65
+STEP_MARGIN = 1.5
+"""Factors on the first bounce, its color and its wavelengths, for parts of patches; set on 4 scenes
+of the flash rig and under grazing light."""
+
 LATERAL_MARGIN = 0.6
 LENS_MARGIN = 0.6
-"""Factors on the sizes of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
+"""Factors on steps of sampled light, set on 8 scenes of the flash rig and 6 of the dome."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +71,9 @@ class ViewingConditions:
     caster: Caster
     """Caster of the mesh."""
     exchange: Interreflection | None
-    """`coarse_exchange` of the mesh; None: it is flat."""
+    """Exchange between the patches of the mesh; None: it is flat, or omitted on request."""
+    relief: ReliefShadow | None
+    """Shadows of a face's relief; None: a target, or omitted on request."""
     noise: PixelNoise
     """Noise of the sensor."""
     effects: SceneEffects
@@ -153,23 +150,22 @@ def interreflection_effects(
     face: LitFace, scenery: ViewingConditions, *, finer: bool
 ) -> list[Effect]:
     """Return interreflection, its color, its wavelengths if these are ``finer``, and its end."""
-    effects = scenery.effects
-    share = max_exchange_fraction(scenery.exchange)
-    why = f"hollows receive {100 * share:.0f} % of what their surroundings send out"
-    found, size, none = None, 0.0, 0.0
-    if scenery.exchange is not None:
+    effects, none = scenery.effects, 0.0
+    name, switch = INTERREFLECTION_EFFECT, "interreflections"
+    found = None
+    if effects.interreflections is False:
+        bounces = Effect(name, "asked", f"{switch}=False requests it", switch=switch)
+    elif scenery.exchange is None:
+        bounces = decide_effect(name, none, None, switch=switch, reason="the surface is flat")
+    else:
         found = SampledBounces(
             face.skin, scenery.exchange, face.light, face.white, scenery.noise, face.reflectance
         )
-        plain = found.arriving(spectral=False)
-        size = BOUNCE_MARGIN * found.over_noise(plain)
-    bounces = decide_effect(
-        INTERREFLECTION_EFFECT,
-        size,
-        effects.interreflections,
-        switch="interreflections",
-        reason=why,
-    )
+        size = BOUNCE_MARGIN * found.over_noise(found.by_channel)
+        share = 100.0 * max_exchange_fraction(scenery.exchange)
+        why = f"hollows receive {share:.0f} % of what their surroundings send out"
+        asked = effects.interreflections
+        bounces = decide_effect(name, size, asked, switch=switch, reason=why)
     if found is None or not bounces.is_built:
         why = "interreflection is absent"
         steps = [Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, none, "spectral_step")]
@@ -179,10 +175,10 @@ def interreflection_effects(
             *(steps if finer else []),
             Effect(FURTHER_BOUNCES_EFFECT, "negligible", why, none, "last_bounce"),
         ]
-    exact = found.arriving(spectral=True)
+    exact = found.by_wavelength()
     spectral = decide_effect(
         SPECTRAL_EFFECT,
-        BOUNCE_MARGIN * found.over_noise(exact, plain),
+        SPECTRAL_MARGIN * found.over_noise(exact, found.by_channel),
         effects.spectral,
         switch="spectral",
         reason="a channel's mean of squares differs from the square of its mean",
@@ -206,31 +202,13 @@ def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Ef
 
 def relief_shadow_effect(face: LitFace, scenery: ViewingConditions) -> Effect:
     """Return whether the relief of a face shadows itself."""
-    subject = face.skin.subject
-    covered = subject.atlas.covered
-    across, along = (mm[covered] for mm in subject.atlas.texel_mm())
-    down, right = (
-        np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
-    )
-    steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
+    name, switch = RELIEF_SHADOW_EFFECT, "relief_shadows"
+    if scenery.relief is None:
+        return Effect(name, "asked", f"{switch}=False requests it", switch=switch)
     pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
-    size = relief_shadows_over_noise(
-        subject,
-        scenery.caster,
-        ReliefShadow(subject, RULE_DIRECTIONS),
-        face.light,
-        face.reflectance,
-        face.white,
-        scenery.noise,
-        pixel_mm,
-    )
-    return decide_effect(
-        RELIEF_SHADOW_EFFECT,
-        size,
-        scenery.effects.relief_shadows,
-        switch="relief_shadows",
-        reason=f"relief as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
-    )
+    size = relief_shadows_over_noise(face, scenery.caster, scenery.relief, scenery.noise, pixel_mm)
+    asked = scenery.effects.relief_shadows
+    return decide_effect(name, size, asked, switch=switch, reason="pores and wrinkles hide lights")
 
 
 def face_lens_effect(face: LitFace, scenery: ViewingConditions) -> Effect:
@@ -349,7 +327,7 @@ def _tissue_effects(
     return select_tissue_effects(skin.subject.tissue, change, scenery.effects)
 
 
-def _wavelength_step_effect(found: SampledBounces, exact: Float64Array, spectral: Effect) -> Effect:
+def _wavelength_step_effect(found: SampledBounces, exact: FloatArray, spectral: Effect) -> Effect:
     """Return whether interreflection requires all of the table's wavelengths."""
     if not spectral.is_built:
         return Effect(
@@ -357,7 +335,7 @@ def _wavelength_step_effect(found: SampledBounces, exact: Float64Array, spectral
         )
     change, chosen = math.inf, 1
     for step in WAVELENGTH_STEPS:
-        change = STEP_MARGIN * found.over_noise(exact, found.arriving(spectral=True, step=step))
+        change = STEP_MARGIN * found.over_noise(exact, found.by_wavelength(step))
         if change < NEGLIGIBLE_NOISE_RATIO:
             chosen = step
             break
@@ -369,11 +347,11 @@ def _wavelength_step_effect(found: SampledBounces, exact: Float64Array, spectral
 
 def _further_bounces_effect(found: SampledBounces) -> Effect:
     """Return the effect of bounces after the last summed one, and where the sum ends."""
-    exact = found.arriving(spectral=False, last=EXACT_BOUNCE_FRACTION)
-    for last in BOUNCE_CANDIDATES:
-        left = BOUNCE_MARGIN * found.over_noise(exact, found.arriving(spectral=False, last=last))
-        if left < MAX_REMAINING_NOISE_RATIO:
-            break
+    last, left = next(
+        (last, BOUNCE_MARGIN * change)
+        for last, change in found.further_bounces()
+        if BOUNCE_MARGIN * change < MAX_REMAINING_NOISE_RATIO
+    )
     return decide_effect(
         FURTHER_BOUNCES_EFFECT,
         left,

@@ -1,7 +1,6 @@
 """Sample the light on a face before anything is rendered, for the sizes of effects.
 
-Every n-th texel receives the direct light of each lamp by a few shadow rays. Interreflection is
-computed between coarse patches. Both cost a small part of one image.
+Every n-th texel receives the direct light of each lamp by a few shadow rays.
 """
 
 from __future__ import annotations
@@ -9,31 +8,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
-from rigsim.light.interreflection import (
-    Interreflection,
-    InterreflectionColor,
-    InterreflectionSettings,
-    coarse_skin,
-)
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.subsurface_radiance import inner_albedo
+from rigsim.mitsuba.olat import RAY_OFFSET_MM
 from rigsim.needs.effects import PixelNoise
-from rigsim.render import Caster, visibility
+from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_layers import ETA
 
 SAMPLED_TEXELS: Final = 64
 """Largest number of sampled texels along each side of the texture."""
 
-SHADOW_SAMPLES: Final = 2
-"""Shadow rays per sampled texel and lamp."""
+SHADOW_RADII: Final = (-0.7, 0.7)
+"""Points on a lamp's disc for shadow rays, in radii off its center."""
 
 MIN_VIEW_COSINE: Final = 0.02
 """Cosine between normal and camera below which a texel is not visible."""
@@ -43,13 +35,6 @@ TEXEL_STEP: Final = 16
 
 OUTLINE_COSINE: Final = 0.5
 """Cosine between normal and camera below which a texel counts as near the face's outline."""
-
-BOUNCE_CANDIDATES: Final = (0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
-"""Fractions of the first bounce at which the sum may end, largest first."""
-
-EXACT_BOUNCE_FRACTION: Final = 1e-7
-"""Fraction of the first bounce at which the sum is exact in single precision."""
-
 
 TexelIndex: TypeAlias = tuple[Int64Array, Int64Array]
 
@@ -65,6 +50,17 @@ class SampledLamp:
     weight_mm2: float
     """Irradiance of a facing surface times its squared distance, over that of a white plate."""
 
+    def radius(self) -> Float64Array:
+        """Return a radius of the disc, mm, shape (3,)."""
+        across = np.cross(self.position_mm, np.eye(3)[int(np.argmin(np.abs(self.position_mm)))])
+        return np.asarray(self.radius_mm / float(np.linalg.norm(across)) * across, np.float64)
+
+    def direction_and_falloff(self, position_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return unit vectors from points to the lamp, and the inverse squared distance, 1/mm2."""
+        way = np.asarray(self.position_mm, np.float32) - position_mm
+        squared = np.einsum("ij,ij->i", way, way)
+        return way / np.sqrt(squared)[:, None], np.float32(1.0) / squared
+
 
 @dataclass(frozen=True, eq=False)
 class SampledLight:
@@ -72,8 +68,9 @@ class SampledLight:
 
     covered: BoolArray
     """Texels with skin, shape (n, n)."""
-    visible: BoolArray
-    """Those that face a camera, shape (n, n)."""
+    facing: Float32Array
+    """Largest cosine between the mesh's normal and a camera that sees the texel, shape (n, n); 0:
+    no camera sees it."""
     irradiance: Float32Array
     """Irradiance over that of a white plate, with shadows of the mesh, shape (K, n, n)."""
     highlight: Float32Array
@@ -86,6 +83,11 @@ class SampledLight:
     """Lamps of each image."""
     part: tuple[slice, slice]
     """Sampled rows and columns of the face's texture."""
+
+    @property
+    def visible(self) -> BoolArray:
+        """Texels that a camera sees, shape (n, n)."""
+        return self.facing > 0.0
 
     def neighbors(self) -> Iterator[tuple[TexelIndex, TexelIndex]]:
         """Iterate over pairs of index arrays of neighboring texels: along u, and along v."""
@@ -136,24 +138,18 @@ def sample_light(
     to_cameras = np.asarray(cameras_mm, np.float32)[:, None] - position
     to_cameras /= np.linalg.norm(to_cameras, axis=-1, keepdims=True)
     cosines = np.einsum("vij,ij->vi", to_cameras, mesh_normal)
+    # a camera sees the points that it would light
+    eyes = [SampledLamp((float(x), float(y), float(z)), 0.0, 1.0) for x, y, z in cameras_mm]
+    shown = visible_fractions(caster, position, mesh_normal, eyes) > 0.0
+    shown &= cosines > MIN_VIEW_COSINE
     light, shine = (np.zeros((len(images), len(where)), np.float32) for _ in range(2))
-    for k, lamps in enumerate(images):
-        for lamp in lamps:
-            seen = visibility(
-                caster,
-                position,
-                mesh_normal,
-                lamp.position_mm,
-                radius_mm=lamp.radius_mm,
-                samples=SHADOW_SAMPLES,
-            )
-            way = np.asarray(lamp.position_mm, np.float32) - position
-            squared = np.einsum("ij,ij->i", way, way)
-            way /= np.sqrt(squared)[:, None]
-            strength = np.float32(lamp.weight_mm2) / squared * seen
-            light[k] += strength * np.clip(np.einsum("ij,ij->i", way, normal), 0.0, None)
-            facets = reflect_facets(normal, way, to_cameras[0], alpha)
-            shine[k] += strength * bare * facets
+    each = [(k, lamp) for k, lamps in enumerate(images) for lamp in lamps]
+    parts = visible_fractions(caster, position, mesh_normal, [lamp for _, lamp in each])
+    for (k, lamp), seen in zip(each, parts, strict=True):
+        way, falloff = lamp.direction_and_falloff(position)
+        strength = np.float32(lamp.weight_mm2) * falloff * seen
+        light[k] += strength * np.clip(np.einsum("ij,ij->i", way, normal), 0.0, None)
+        shine[k] += strength * bare * reflect_facets(normal, way, to_cameras[0], alpha)
 
     def fill(values: FloatArray) -> Float32Array:
         out = np.zeros((*values.shape[:-1], covered.size), np.float32)
@@ -162,7 +158,7 @@ def sample_light(
 
     return SampledLight(
         covered,
-        fill((cosines > MIN_VIEW_COSINE).any(axis=0)) > 0.0,
+        fill(np.where(shown, cosines, 0.0).max(axis=0)),
         fill(light),
         fill(shine),
         fill(cosines[0]),
@@ -170,6 +166,31 @@ def sample_light(
         tuple(tuple(lamps) for lamps in images),
         part,
     )
+
+
+def visible_fractions(
+    caster: Caster, position_mm: Float32Array, normal: Float32Array, lamps: Sequence[SampledLamp]
+) -> Float32Array:
+    """Return the visible fraction of lamps from points of a mesh, shape (L, n), by few rays.
+
+    Parameters
+    ----------
+    caster
+        The mesh.
+    position_mm, normal
+        Points and normals of the mesh, shape (n, 3).
+    lamps
+        The lamps, whose discs face the rig's origin.
+    """
+    start = position_mm + np.float32(RAY_OFFSET_MM) * normal
+    targets = [lamp.position_mm + r * lamp.radius() for lamp in lamps for r in SHADOW_RADII]
+    ways = np.asarray(targets, np.float32)[:, None] - start
+    lengths = np.linalg.norm(ways, axis=-1)
+    ways /= lengths[..., None]
+    out = np.einsum("lij,ij->li", ways, normal) > 0.0
+    starts = np.broadcast_to(start, ways.shape)[out]
+    out[out] = ~caster.is_blocked(starts, ways[out], np.float32(0.999) * lengths[out])
+    return out.reshape(len(lamps), len(SHADOW_RADII), -1).mean(axis=1, dtype=np.float32)
 
 
 def reflect_facets(
@@ -212,78 +233,6 @@ def reflect_facets(
     fresnel = np.maximum(across**2, along**2)
     found = 2.0 * np.pi * fresnel * density / (4.0 * nv * (1.0 + hidden[0] + hidden[1]))
     return np.where(lit, found, 0.0).astype(np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class SampledBounces:
-    """Interreflection on a face between coarse patches, in the image where it is largest."""
-
-    skin: ObservedSkin
-    """The face."""
-    exchange: Interreflection
-    """Exchange between its coarse patches."""
-    light: SampledLight
-    """Direct light."""
-    white: Float64Array
-    """Signal of a white plate in each image, full scales, shape (K, 3)."""
-    noise: PixelNoise
-    """Noise of the sensor."""
-    reflectance: Float32Array
-    """The face's reflectance, shape (N, N, 3)."""
-
-    @cached_property
-    def _reflecting(self) -> tuple[Float32Array, Float32Array]:
-        return inner_albedo(self.skin.subject, self.reflectance), self.reflectance
-
-    @cached_property
-    def _direct(self) -> Float32Array:
-        """Direct light on the patches, (P, K), and behind it visibility and coverage."""
-        light = self.light
-        layers = np.concatenate([light.irradiance, light.visible[None], light.covered[None]])
-        return self.exchange.coarsen(np.moveaxis(layers * light.covered, 0, -1).astype(np.float32))
-
-    @cached_property
-    def _worst(self) -> tuple[int, Float32Array]:
-        """Image in which the first bounce is largest over the noise, and its direct light."""
-        direct = self._direct[:, :-2] / np.maximum(self._direct[:, -1:], np.float32(1e-6))
-        r_d = self._patch_reflectance
-        most = -1.0, 0
-        first = self.exchange.exchange @ (r_d[:, :1] * direct)
-        for k in range(direct.shape[1]):
-            signal = self.white[k] * r_d * first[:, k, None]
-            lit = signal + self.white[k] * r_d * direct[:, k, None]
-            change = (signal / self.noise.sigma(lit))[self._is_visible].max(initial=0.0)
-            most = max(most, (float(change), k))
-        return most[1], np.ascontiguousarray(direct[:, most[1]])
-
-    @cached_property
-    def _is_visible(self) -> BoolArray:
-        return np.asarray(self._direct[:, -2] > 0.0)
-
-    @cached_property
-    def _coarse(self) -> Float32Array:
-        """`rigsim.light.interreflection.coarse_skin` of the face."""
-        return coarse_skin(self.exchange, self.skin, *self._reflecting)
-
-    @property
-    def _patch_reflectance(self) -> Float32Array:
-        """Mean factor of the diffuse term on the patches, (P, 3)."""
-        return self._coarse[:, 7:]
-
-    def arriving(self, *, spectral: bool, step: int = 1, last: float = 1e-4) -> Float64Array:
-        """Return the interreflected light that enters each patch, shape (P, 3)."""
-        how = InterreflectionSettings(self.exchange, spectral, step, last)
-        color = InterreflectionColor(how, self.skin, *self._reflecting, self._coarse)
-        found = color.indirect_irradiance(self._worst[1])
-        return np.asarray(found[self.exchange.atlas.covered], np.float64)
-
-    def over_noise(self, arriving: Float64Array, other: Float64Array | float = 0.0) -> float:
-        """Return the largest change of a pixel over its noise between two results of `arriving`."""
-        k, direct = self._worst
-        unit = self.white[k] * self._patch_reflectance
-        sigma = self.noise.sigma(unit * (direct[:, None] + arriving))
-        change = np.abs(unit * (arriving - other)) / sigma
-        return float(change[self._is_visible].max(initial=0.0))
 
 
 def scattering_over_noise(

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from rigsim.arrays import Float64Array, FloatArray
+from rigsim.caching import cached_method
 from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue
 from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, SceneEffects, decide_effect
 from rigsim.skin_patch.microrelief import MicroSkin, change_patch_tissue
@@ -165,7 +166,7 @@ def _typical_in(tissue: TissueProperties, fields: tuple[str, ...]) -> TissueProp
     return dataclasses.replace(tissue, **typical)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class SkinSample:
     """Skins that represent a subject: signals of its pixels, and its lateral scattering."""
 
@@ -193,12 +194,14 @@ class SkinSample:
         melanin, blood = (part.ravel() for part in np.meshgrid(*each))
         return cls(melanin, blood, band_weights)
 
+    @cached_method
     def signals(self, tissue: TissueProperties) -> Float64Array:
         """Return the reflectance in the camera's channels, shape (P, C)."""
         wavelength = WAVELENGTH_NM[::RULE_WAVELENGTH_STEP]
         spectra = interpolate_spectra(self.c_m, self.c_hd, tissue, wavelength)
         return np.asarray(spectra @ self.band_weights)
 
+    @cached_method
     def diffuse_path_mm(self, tissue: TissueProperties) -> Float64Array:
         """Return the mean free path of diffuse light in the dermis, 1 / sigma_tr, shape (P, C)."""
         wavelength = WAVELENGTH_NM[::RULE_WAVELENGTH_STEP]

@@ -1,6 +1,7 @@
 """Base classes of scenes: views, sensors, exposures, and caches of their light."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -8,6 +9,8 @@ import numpy as np
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.light.interreflection import DEFAULT_MIN_BOUNCE_FRACTION, Interreflection
+from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.needs.effect_sizes import exchange_unless_flat
 from rigsim.needs.effects import EffectSelection, PixelNoise, SceneEffects
 from rigsim.needs.face import FURTHER_BOUNCES_EFFECT, ViewingConditions
 from rigsim.render import Caster
@@ -144,6 +147,31 @@ class RigScene:
         return expose_sensor(light, sensor=self.sensor(view.name), rng=rng, exposure_s=exposure_s)
 
 
+class FaceGeometry:
+    """Traced geometry of one face or target.
+
+    Parameters
+    ----------
+    caster
+        Caster of the mesh.
+    """
+
+    def __init__(self, caster: Caster) -> None:
+        self.caster = caster
+        self._relief: ReliefShadow | None = None
+
+    @cached_property
+    def exchange(self) -> Interreflection | None:
+        """`rigsim.needs.effect_sizes.exchange_unless_flat` of the mesh."""
+        return exchange_unless_flat(self.caster)
+
+    def relief(self, subject: SimulatedSubject) -> ReliefShadow:
+        """Return the shadows of a face's relief."""
+        if self._relief is None:
+            self._relief = ReliefShadow(subject)
+        return self._relief
+
+
 class FaceScene(RigScene):
     """A face or a target under lights of one spectrum, in front of cameras."""
 
@@ -184,16 +212,16 @@ class FaceScene(RigScene):
         return self.subject
 
     def _scenery(
-        self,
-        view: View,
-        caster: Caster,
-        exchange: Interreflection | None,
-        noise: PixelNoise,
-        effects: SceneEffects,
+        self, view: View, geometry: FaceGeometry, noise: PixelNoise, effects: SceneEffects
     ) -> ViewingConditions:
         """Return the viewing conditions of a camera."""
+        exchange, relief, caster = None, None, geometry.caster
+        if isinstance(self.subject, Target) or effects.interreflections is not False:
+            exchange = geometry.exchange
+        if isinstance(self.subject, SimulatedSubject) and effects.relief_shadows is not False:
+            relief = geometry.relief(self.subject)
         return ViewingConditions(
-            view, self._illuminant, caster, exchange, noise, effects, self.subpixels
+            view, self._illuminant, caster, exchange, relief, noise, effects, self.subpixels
         )
 
     def _last_bounce(self, effects: SceneEffects) -> float:

@@ -40,7 +40,6 @@ from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.dome import min_noise, sample_led_light, select_dome_effects
-from rigsim.needs.effect_sizes import coarse_exchange
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
@@ -49,7 +48,7 @@ from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome.images import LightImages
 from rigsim.scenes.dome.rendering import LitScene
 from rigsim.scenes.dome.rows import AddedSkinLight, DomeRows, DomeSubsurfaceRadiance, normalize
-from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
+from rigsim.scenes.exposing import FaceGeometry, FaceScene, SceneError, full_power_duration_s
 from rigsim.sensor import apply_cfa
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -131,8 +130,8 @@ class DomeScene(FaceScene):
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
         noise = min_noise([PixelNoise.of(sensor) for sensor in self._sensors.values()])
-        exchange = coarse_exchange(self._caster)
-        scenery = self._scenery(rig.views[0], self._caster, exchange, noise, effects)
+        self._geometry = FaceGeometry(self._caster)
+        scenery = self._scenery(rig.views[0], self._geometry, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
         sampled = sample_led_light(rig, self.subject, self._caster)
         seen = (scenery, white, sampled, movement, motion)
@@ -145,7 +144,7 @@ class DomeScene(FaceScene):
         glow: DomeSubsurfaceRadiance | None = None
         if isinstance(self.subject, SimulatedSubject):
             if self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT):
-                self._relief = ReliefShadow(self.subject)
+                self._relief = self._geometry.relief(self.subject)
             if self.subsurface or self.interreflections:
                 glow = DomeSubsurfaceRadiance(self._scattering)
         self._added = AddedSkinLight(glow, self._relief, self.subsurface)

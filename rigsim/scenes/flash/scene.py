@@ -24,10 +24,9 @@ from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.boxes.flash import FlashPop
 from rigsim.caching import cached_method
 from rigsim.geometry.mesh import Mesh
-from rigsim.light.interreflection import InterreflectionSettings
+from rigsim.light.interreflection import InterreflectionSettings, interreflection_for
 from rigsim.light.lateral import edge_width_mm
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.subsurface_radiance import (
     SubsurfaceRadiance,
     SurfaceIllumination,
@@ -143,8 +142,8 @@ class FlashScene(FaceScene):
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
-        noise, exchange = PixelNoise.of(self._sensors[view.name]), self._stage.coarse_exchange
-        scenery = self._scenery(view, self._caster, exchange, noise, self._effects)
+        noise = PixelNoise.of(self._sensors[view.name])
+        scenery = self._scenery(view, self._stage, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
         seen = (
             scenery,
@@ -372,9 +371,8 @@ class FlashScene(FaceScene):
         spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
         chosen = int(self.needs[face_needs.WAVELENGTH_STEP_EFFECT].choice or 1)
         step = self._effects.spectral_step or chosen
-        return InterreflectionSettings(
-            self._stage.exchange, spectral, step, self._last_bounce(self._effects)
-        )
+        exchange, last = interreflection_for(self._caster), self._last_bounce(self._effects)
+        return InterreflectionSettings(exchange, spectral, step, last)
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceIllumination:
         shaded = self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT)
@@ -386,7 +384,7 @@ class FlashScene(FaceScene):
                 self._flashes.weights,
                 self.films,
                 caster=self._caster,
-                relief=ReliefShadow(subject) if shaded else None,
+                relief=self._stage.relief(subject) if shaded else None,
             )
         return known[key]
 

@@ -1,24 +1,22 @@
 """Share the traced geometry between flash scenes that differ in the blood only."""
 
-from functools import cached_property
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from capture.rig import View
 from rigsim.geometry.mesh import Mesh
-from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.light.subsurface_radiance import SurfaceIllumination
 from rigsim.mitsuba.variant import VariantChoice
-from rigsim.needs.effect_sizes import coarse_exchange
 from rigsim.needs.sampled_light import SampledLamp, SampledLight, sample_light
 from rigsim.render import Caster
+from rigsim.scenes.exposing import FaceGeometry
 from rigsim.scenes.flash.surfaces import FlashLights
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
 
-class FlashGeometry:
+class FlashGeometry(FaceGeometry):
     """One geometry with its traced rays.
 
     Parameters
@@ -30,14 +28,10 @@ class FlashGeometry:
     """
 
     def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
-        self.held, self.caster = held, caster
+        super().__init__(caster)
+        self.held = held
         self.light: dict[object, SurfaceIllumination] = {}  # on the face, by its source
         self.sampled: dict[object, SampledLight] = {}  # the same for rules, by source and camera
-
-    @cached_property
-    def coarse_exchange(self) -> Interreflection | None:
-        """`rigsim.needs.effect_sizes.coarse_exchange` of the mesh."""
-        return coarse_exchange(self.caster)
 
     def sample_light(
         self, subject: SimulatedSubject | Target, flashes: FlashLights, view: View
@@ -54,11 +48,6 @@ class FlashGeometry:
             cameras = np.array([view.position_mm])
             self.sampled[key] = sample_light(subject, self.caster, [lamps], cameras)
         return self.sampled[key]
-
-    @cached_property
-    def exchange(self) -> Interreflection:
-        """Interreflection of the mesh."""
-        return interreflection_for(self.caster)
 
 
 _stages: WeakValueDictionary[tuple[object, ...], FlashGeometry] = WeakValueDictionary()

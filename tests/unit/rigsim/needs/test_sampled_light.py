@@ -31,7 +31,7 @@ def half_lit(level=1.0, size=8):
     lit[..., size // 2 :] = level
     front, place = np.ones((size, size), np.float32), np.zeros((size, size, 3), np.float32)
     part = (slice(0, None, 1), slice(0, None, 1))
-    return SampledLight(full, full, lit, 0.0 * lit, front, place, (), part)
+    return SampledLight(full, front, lit, 0.0 * lit, front, place, (), part)
 
 
 def test_scattering_size_is_that_of_one_edge():
