@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from rigsim.arrays import BoolArray, Float32Array, Int64Array
+from rigsim.arrays import Float32Array
 from rigsim.light.surface_brdf import transmittance
 from rigsim.subject import SimulatedSubject
 
@@ -104,15 +104,6 @@ class ReliefShadow:
             ]
         )
         self._highest = _bound_horizons(self._du, self._dv, self._horizon.max(axis=0))
-
-    def highest_horizons(self, covered: BoolArray, count: int) -> tuple[Int64Array, Int64Array]:
-        """Return rows and columns of the covered texels with the highest horizons, (n,) each."""
-        longest = np.sqrt(np.sum(self._du**2, axis=-1)), np.sqrt(np.sum(self._dv**2, axis=-1))
-        texel = np.maximum(np.minimum(*longest), np.float32(1e-6))
-        slope = np.where(covered, self._horizon.max(axis=0) / texel, np.float32(0.0))
-        found = np.argsort(slope, axis=None)[-count:]
-        row, column = np.unravel_index(found[slope.reshape(-1)[found] > 0.0], slope.shape)
-        return row, column
 
     def visible_fraction(
         self,
