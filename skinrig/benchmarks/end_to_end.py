@@ -196,21 +196,44 @@ def measure_person(
     begun_s = time.process_time()
     choices = list_choices_within_budget(planner.generate_choices, rig, request)
     plan_s = time.process_time() - begun_s
+    chosen: list[tuple[float, PlanChoice]] = []
+    for budget_s in budgets_s:
+        if within := [one for one in choices if one.run_times["total"] <= budget_s]:
+            chosen.append((budget_s, select_best(within, request.min_valid_fraction)))
+    found = measure_choices(person, [choice for _, choice in chosen], plan_s, calibration_seed)
+    for (budget_s, choice), one in zip(chosen, found, strict=True):
+        yield budget_s, choice, one
+
+
+def measure_choices(
+    person: Person, choices: Sequence[PlanChoice], plan_s: float, calibration_seed: int
+) -> Iterator[MeasuredCapture]:
+    """Calibrate, capture and reconstruct plans of a person; yield the measurement of each.
+
+    Parameters
+    ----------
+    person
+        Preset and seed of the subject.
+    choices
+        Plans of one rig; equal ones are captured once.
+    plan_s
+        Processor time of their choice, s.
+    calibration_seed
+        Seed of noise and poses of the calibration targets.
+    """
+    subject, seed = person
     calibrated: dict[str, tuple[Path, float]] = {}
     done: dict[str, MeasuredCapture] = {}
     with tempfile.TemporaryDirectory() as name:
-        for budget_s in budgets_s:
-            within = [one for one in choices if one.run_times["total"] <= budget_s]
-            if not within:
-                continue
-            choice = select_best(within, request.min_valid_fraction)
+        for choice in choices:
             key = str(choice.plan.to_json())
             if key not in done:
-                steps = planner.describe_rehearsal(choice)
+                steps = load_planner(choice.rig.name).describe_rehearsal(choice)
                 used = str(steps.targets)  # those of the dome contain its plan
                 if used not in calibrated:
                     folder = Path(name) / f"calibrated-{len(calibrated)}"
-                    calibrated[used] = folder, _calibrate(rig, steps, folder, calibration_seed)
+                    seconds = _calibrate(choice.rig, steps, folder, seed, calibration_seed)
+                    calibrated[used] = folder, seconds
                 folder, calibrate_s = calibrated[used]
                 own = Path(name) / f"captured-{len(done)}"
                 own.mkdir()
@@ -218,14 +241,17 @@ def measure_person(
                 found = capture_choice(choice, own, subject=subject, seed=seed)
                 times = RunTimes(plan_s, found.capture_s, calibrate_s, found.reconstruct_s)
                 done[key] = MeasuredCapture(found.errors, times)
-            yield budget_s, choice, done[key]
+            yield done[key]
 
 
-def _calibrate(rig: Rig, steps: Rehearsal, folder: Path, seed: int) -> float:
-    """Simulate the targets, calibrate, and return the processor seconds of the calibration."""
-    drawn = {"session_seed": seed}  # others set the constants of forecasts
+def _calibrate(rig: Rig, steps: Rehearsal, folder: Path, rig_seed: int, session_seed: int) -> float:
+    """Simulate the targets, calibrate, and return the processor seconds of the calibration.
+
+    Dome and sphere as built depend on the subject's seed, `rig_seed`.
+    """
+    drawn = {"session_seed": session_seed}  # others set the constants of forecasts
     targets = {name: {**how, **drawn} for name, how in steps.targets.items()}
-    calibrate_simulated(rig.name, folder, targets, (), seed=0)
+    calibrate_simulated(rig.name, folder, targets, (), seed=rig_seed)
     seconds = 0.0
     for kind, used in steps.calibrations:
         sessions = [folder / f"session-{target}" for target in used]

@@ -47,8 +47,10 @@ class DomeObservation:
     """(P, 3) unit normals."""
     to_light: Float64Array
     """(P, L, 3) unit vectors to the lights."""
-    variance: Float64Array
-    """(P, L, V) relative variance of a sample; infinite where it has no information."""
+    rate: Float64Array
+    """(P, L) light of a sample, full scales of the sensor per second."""
+    usable: BoolArray
+    """(P, L, V): the sample is neither shadowed, grazing nor in the highlight."""
     lit: BoolArray
     """(P, L): the point is visible from the light."""
     seen: BoolArray
@@ -62,12 +64,25 @@ class DomeObservation:
     r_d: Float64Array
     """(P, 3) albedo, camera RGB."""
     pixel_mm: float
+    full_well_e: float
+    read_noise_e: float
 
-    def information(self, views: Sequence[int]) -> FisherInformation:
-        """Return the Fisher information of each point per light, over a subset of the cameras."""
-        seen = self.variance[..., list(views)]
-        with np.errstate(divide="ignore"):
-            noise = 1.0 / np.sum(1.0 / seen, axis=-1)
+    def information(
+        self, views: Sequence[int], exposures_s: Sequence[float] = DOME_EXPOSURES_S
+    ) -> FisherInformation:
+        """Return the Fisher information of each point per light, over a subset of the cameras.
+
+        Parameters
+        ----------
+        views
+            Numbers of the cameras.
+        exposures_s
+            Exposure times of each light, s; their samples are merged.
+        """
+        variance = _relative_variance(self.rate, exposures_s, self.full_well_e, self.read_noise_e)
+        cameras = np.count_nonzero(self.usable[..., list(views)], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            noise = np.where(cameras > 0, variance / cameras, np.inf)
         enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.MIN_VIEWS
         noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
         return light_selection.fisher_information(
@@ -130,8 +145,7 @@ def simulate_observation(
     # diffuse reflection of a point light: R_d I cos(theta) / d^2, in full scales per second
     rate = r_d[:, None] * white * cos_light / light_mm**2
     chip = make_sensor(view)
-    variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
-    there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
+    usable = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
     # similar triangles: size on the subject = size on the sensor x distance / focal length; a cell
     # of the color filter has two sensor pixels per side
     pixel = float(
@@ -140,7 +154,8 @@ def simulate_observation(
     return DomeObservation(
         normal,
         to_light,
-        np.where(there, variance[:, :, None], np.inf),
+        rate,
+        usable,
         lit,
         seen,
         np.ones(len(place)),
@@ -151,6 +166,8 @@ def simulate_observation(
         _gaussian_mean(surface.r_d, face.atlas, BLUR_PX * pixel)[drawn] / rgb - 1.0,
         rgb,
         pixel,
+        chip.full_well_e,
+        chip.read_noise_e,
     )
 
 
@@ -170,12 +187,14 @@ def _trace_to_positions(
     return way, length, free
 
 
-def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
+def _relative_variance(
+    rate: Float64Array, exposures_s: Sequence[float], full_well_e: float, read_noise_e: float
+) -> Float64Array:
     """Return the relative variance of a merged exposure series."""
     information = np.zeros(rate.shape)
     # brackets are merged by inverse variance, so that the information of the unsaturated ones adds:
     # (N / sigma)^2 with N electrons and sigma^2 = N (shot noise) + read noise^2
-    for seconds in DOME_EXPOSURES_S:
+    for seconds in exposures_s:
         electrons = np.maximum(rate, 0.0) * seconds * full_well_e
         kept = (electrons > 0) & (electrons < 0.95 * full_well_e)
         information += np.where(kept, electrons**2 / (electrons + read_noise_e**2), 0.0)
