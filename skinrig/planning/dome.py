@@ -16,7 +16,7 @@ import numpy as np
 from capture.plan import Plan
 from capture.plan.dome import DOME_EXPOSURES_S, dome_plan
 from capture.plan.rows import step_lights
-from capture.rig import Rig
+from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance
 from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import ErrorPrediction
@@ -43,7 +43,7 @@ It is the same for all skin, thus relatively larger on dark skin. It averages ov
 LIGHT_COUNTS = (10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 60, 75, 100, 125, 150)
 """Numbers of lights of the plans within a time."""
 VIEW_COUNTS = (4, 5, 6, 8, 12, 16)
-"""Numbers of cameras of these plans; fewer hardly calibrate each other."""
+"""Numbers of cameras of these plans."""
 EXPOSURE_CHOICES = (DOME_EXPOSURES_S[:1], DOME_EXPOSURES_S)
 """Exposure times per light of these plans, s.
 
@@ -229,10 +229,16 @@ def rank_views(observation: DomeObservation) -> list[int]:
 
 
 def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
-    """Return the targets and calibrations that confirm a choice, with its lights and cameras."""
+    """Return the targets and calibrations that confirm a choice, with its lights.
+
+    All cameras of the rig are calibrated: few of them need not share a pose of the board.
+    """
     width = {"width_px": choice.rig.views[0].width_px}
+    lit = width | {"plan": choice.plan}
+    whole = load_rig(choice.rig.name)
+    every = {"lights": len(whole.lights), "views": len(whole.views)}
     return plans.Rehearsal(
-        dict.fromkeys(("charuco", "mirror", "white"), width | {"plan": choice.plan}),
+        {"charuco": width | every, "mirror": lit, "white": lit},
         (("geometry", ("charuco",)), ("lights", ("mirror", "white"))),
         ("normals", "r_d"),
         width,

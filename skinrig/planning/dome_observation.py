@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from capture.plan.dome import DOME_EXPOSURES_S
 from capture.rig import Rig
+from reconstruction.lumitexels.samples import MIN_VISIBLE_COSINE
 from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import FisherInformation
 from reconstruction.surface import errors as surface_errors
@@ -174,11 +175,15 @@ def simulate_observation(
 def _trace_to_positions(
     caster: Any, start: Float64Array, normal: Float64Array, positions_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return unit vectors, distances (mm) and unobstructed visibility from points to positions."""
+    """Return unit vectors, distances (mm) and unobstructed visibility from points to positions.
+
+    As in the reconstruction, a position so low over the surface that a sample of it is not used
+    does not count as visible.
+    """
     away = positions_mm[None] - start[:, None]
     length = np.linalg.norm(away, axis=-1)
     way = away / length[..., None]
-    front = np.einsum("pqk,pk->pq", way, normal) > 0
+    front = np.einsum("pqk,pk->pq", way, normal) > MIN_VISIBLE_COSINE
     free = np.zeros(front.shape, np.bool_)
     point, place = np.nonzero(front)
     free[point, place] = ~caster.is_blocked(
