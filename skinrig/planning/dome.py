@@ -47,8 +47,8 @@ VIEW_COUNTS = (4, 5, 6, 8, 12, 16)
 EXPOSURE_CHOICES = (DOME_EXPOSURES_S[:1], DOME_EXPOSURES_S)
 """Exposure times per light of these plans, s.
 
-The second, shorter exposure doubles the duration. It is for highlights, which the estimates of
-normals and R_d leave out."""
+The second, shorter exposure doubles the duration. It is for highlights, which the estimate of
+normals leaves out."""
 
 
 @dataclass(frozen=True, slots=True)
