@@ -26,6 +26,8 @@ from reconstruction.arrays import BoolArray, Float64Array
 
 UNKNOWN_ERROR_RAD = np.radians(10.0)
 """Error assigned to a point without an estimate: about that of a scan's normals."""
+MIN_INFORMATIVE_LIGHTS = 4
+"""Least number of lights that inform a point's normal and albedo and can contradict each other."""
 _PRIOR_INFORMATION = 1e-6
 """Information before the first light: standard deviations of 1000 of tilts and log albedo."""
 
@@ -87,7 +89,8 @@ class ErrorPrediction:
     log_albedo : ndarray of float64, shape (P,)
         Standard error of log rho.
     valid : ndarray of bool, shape (P,)
-        At least `min_lights` lights reach the point.
+        At least `min_lights` lights reach the point, and of them at least
+        `MIN_INFORMATIVE_LIGHTS` or `min_lights`, whichever is less, inform it.
     valid_fraction : float
         Fraction of valid points by importance.
     median_rad : float
@@ -193,8 +196,10 @@ def predict_errors(
     """
     chosen = np.asarray(list(lights), np.intp)  # type: ignore[arg-type]
     covariance = np.asarray(np.linalg.inv(_start(information, chosen)), np.float64)
-    reached = np.count_nonzero(information.reaches[:, chosen], axis=1)
-    return _evaluate_prediction(information, covariance, reached, min_lights)
+    reached = np.count_nonzero(information.reaches[:, chosen], axis=1) >= min_lights
+    informed = np.count_nonzero(information.weight[:, chosen], axis=1)
+    valid = reached & (informed >= min(min_lights, MIN_INFORMATIVE_LIGHTS))
+    return _evaluate_prediction(information, covariance, valid)
 
 
 def select_lights(
@@ -297,10 +302,9 @@ def _loss(
 
 
 def _evaluate_prediction(
-    found: FisherInformation, covariance: Float64Array, reached: NDArray[np.intp], min_lights: int
+    found: FisherInformation, covariance: Float64Array, valid: BoolArray
 ) -> ErrorPrediction:
     variance = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + found.systematic_rad**2
-    valid = np.asarray(reached >= min_lights)
     total = float(found.importance.sum())
     share = float(found.importance[valid].sum()) / total if total > 0 else 0.0
     return ErrorPrediction(

@@ -6,13 +6,14 @@ compared with their forecasts.
 """
 
 import math
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,6 +60,7 @@ class EndToEndCase:
 
 
 CASES: Final[Mapping[str, EndToEndCase]] = {
+    "dome": EndToEndCase((("II", 755), ("IV", 753), ("VI", 754)), {320: (25.0, 28.0, 33.0)}),
     "flash": EndToEndCase(
         tuple(zip(PRESET_NAMES, range(621, 627), strict=True)), {256: (30.0, 45.0, 90.0)}
     ),
@@ -196,44 +198,87 @@ def measure_person(
     begun_s = time.process_time()
     choices = list_choices_within_budget(planner.generate_choices, rig, request)
     plan_s = time.process_time() - begun_s
-    calibrated: dict[str, tuple[Path, float]] = {}
+    chosen: list[tuple[float, PlanChoice]] = []
+    for budget_s in budgets_s:
+        if within := [one for one in choices if one.run_times["total"] <= budget_s]:
+            chosen.append((budget_s, select_best(within, request.min_valid_fraction)))
+    found = measure_choices(person, [choice for _, choice in chosen], plan_s, calibration_seed)
+    for (budget_s, choice), one in zip(chosen, found, strict=True):
+        yield budget_s, choice, one
+
+
+def measure_choices(
+    person: Person, choices: Sequence[PlanChoice], plan_s: float, calibration_seed: int
+) -> Iterator[MeasuredCapture]:
+    """Calibrate, capture and reconstruct plans of a person; yield the measurement of each.
+
+    Parameters
+    ----------
+    person
+        Preset and seed of the subject.
+    choices
+        Plans of one rig; equal ones are captured once.
+    plan_s
+        Processor time of their choice, s.
+    calibration_seed
+        Seed of noise and poses of the calibration targets.
+    """
+    subject, seed = person
     done: dict[str, MeasuredCapture] = {}
     with tempfile.TemporaryDirectory() as name:
-        for budget_s in budgets_s:
-            within = [one for one in choices if one.run_times["total"] <= budget_s]
-            if not within:
-                continue
-            choice = select_best(within, request.min_valid_fraction)
+        calibrations = _Calibrations(Path(name), seed, calibration_seed)
+        for choice in choices:
             key = str(choice.plan.to_json())
             if key not in done:
-                steps = planner.describe_rehearsal(choice)
-                used = str(steps.targets)  # those of the dome contain its plan
-                if used not in calibrated:
-                    folder = Path(name) / f"calibrated-{len(calibrated)}"
-                    calibrated[used] = folder, _calibrate(rig, steps, folder, calibration_seed)
-                folder, calibrate_s = calibrated[used]
+                steps = load_planner(choice.rig.name).describe_rehearsal(choice)
+                calibration, calibrate_s = calibrations.make(choice.rig, steps)
                 own = Path(name) / f"captured-{len(done)}"
                 own.mkdir()
-                (own / "calibration").symlink_to(folder / "calibration")
+                (own / "calibration").symlink_to(calibration)
                 found = capture_choice(choice, own, subject=subject, seed=seed)
                 times = RunTimes(plan_s, found.capture_s, calibrate_s, found.reconstruct_s)
                 done[key] = MeasuredCapture(found.errors, times)
-            yield budget_s, choice, done[key]
+            yield done[key]
 
 
-def _calibrate(rig: Rig, steps: Rehearsal, folder: Path, seed: int) -> float:
-    """Simulate the targets, calibrate, and return the processor seconds of the calibration."""
-    drawn = {"session_seed": seed}  # others set the constants of forecasts
-    targets = {name: {**how, **drawn} for name, how in steps.targets.items()}
-    calibrate_simulated(rig.name, folder, targets, (), seed=0)
-    seconds = 0.0
-    for kind, used in steps.calibrations:
-        sessions = [folder / f"session-{target}" for target in used]
-        # the first call imports modules
-        seconds += measure_processor_time(
-            partial(calibrate, kind, sessions, folder / "calibration"), 2
-        )[0]
-    return seconds
+@dataclass(slots=True)
+class _Calibrations:
+    """Calibrations of one rig as built; those of the same targets are made once."""
+
+    folder: Path
+    rig_seed: int
+    """Seed of the subject, on which the dome and the sphere as built depend."""
+    session_seed: int
+    """Seed of the targets; others set the constants of forecasts."""
+    sessions: dict[str, Path] = field(default_factory=dict)
+    made: dict[str, tuple[Path, float]] = field(default_factory=dict)
+
+    def make(self, rig: Rig, steps: Rehearsal) -> tuple[Path, float]:
+        """Return the folder of a plan's calibrations, and their processor seconds."""
+        key, total_s, folder = "", 0.0, self.folder / "uncalibrated"
+        for kind, used in steps.calibrations:
+            key += f"{kind} {[(name, steps.targets[name]) for name in used]} "
+            if key not in self.made:
+                own = self.folder / f"calibration-{len(self.made)}"
+                if folder.exists():  # a calibration reads those before it
+                    shutil.copytree(folder, own)
+                sessions = [self._simulate(rig, name, steps.targets[name]) for name in used]
+                # the first call imports modules
+                seconds = measure_processor_time(partial(calibrate, kind, sessions, own), 2)[0]
+                self.made[key] = own, seconds
+            folder, seconds = self.made[key]
+            total_s += seconds
+        return folder, total_s
+
+    def _simulate(self, rig: Rig, target: str, options: Mapping[str, Any]) -> Path:
+        """Return the session of a target."""
+        key = f"{target} {options}"
+        if key not in self.sessions:
+            own = self.folder / f"targets-{len(self.sessions)}"
+            drawn = {target: {**options, "session_seed": self.session_seed}}
+            calibrate_simulated(rig.name, own, drawn, (), seed=self.rig_seed)
+            self.sessions[key] = own / f"session-{target}"
+        return self.sessions[key]
 
 
 def _add_point(

@@ -61,8 +61,8 @@ def bench(
     extremes
         Run stiff and extreme cases instead of stages.
     end_to_end
-        Rig whose errors of maps to measure against seconds from planning to maps: flash,
-        gradient or probe; default: none.
+        Rig whose errors of maps to measure against seconds from planning to maps: dome,
+        flash, gradient or probe; default: none.
     out
         Folder for bench.json, a table and plots, or for extremes.json; default: no files.
     more

@@ -43,7 +43,7 @@ class PlanOptions:
     ----------
     budget
         Minimize the error within this time from planning to maps, seconds or minutes, such as 60s
-        or 5min (not for the dome); default: no limit.
+        or 5min; default: no limit.
     min_valid_fraction
         Minimum fraction of the complete rig's valid pixels that stay valid, above 0, at most 1.
     forecast
@@ -79,6 +79,8 @@ def plan_dome(
     Example: skinrig plan dome --goals "normals<=1deg,r_d<=3%" --out plan.json
 
     Example: skinrig plan dome --forecast plan.json
+
+    Example: skinrig plan dome --budget 60s --width 200
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from typing import Any, Final
 
@@ -47,9 +48,14 @@ def list_omissions(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], .
         Per part: whether it is omitted, its key in `data/left_out.toml`, and the values of that
         text's placeholders.
     """
-    table = tomllib.loads(OMISSIONS_TABLE.read_text(encoding="utf-8"))[rig]
+    table = _read_table()[rig]
     named = [(table[name], words) for left, name, *words in rows if left]
     return tuple((row["what"].format(*words), row["why"].format(*words)) for row, words in named)
+
+
+@cache
+def _read_table() -> dict[str, Any]:
+    return tomllib.loads(OMISSIONS_TABLE.read_text(encoding="utf-8"))
 
 
 def explain_less_light(reasons: Sequence[str]) -> str:

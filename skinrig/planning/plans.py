@@ -288,8 +288,6 @@ def choose(
         raise PlanOptionsError(
             f"--max-lights: is an option of the dome, not of the {rig_name} rig; remove it"
         )
-    if asked.budget_s is not None and not hasattr(own, "generate_choices"):
-        raise PlanOptionsError(f"--budget: not an option of the {rig_name} rig; remove it")
     others = {"--goals": asked.goals, "--forecast": forecast, "--bands": asked.leds}
     for other in (name for name, given in others.items() if given and asked.budget_s is not None):
         raise PlanOptionsError(f"--budget: got it together with {other}; remove one")

@@ -112,15 +112,30 @@ def forecast_run_times(rig: Rig, plan: Plan) -> RunTimes:
     (33.748, True)
     """
     seconds = _read_run_times()[rig.name]
-    megapixels = {view.name: view.width_px * view.height_px * 1e-6 for view in rig.all_views}
-    used = {name for step in plan.steps for name in step.cameras}
-    cameras = sum(megapixels[name] for name in used)
-    frames = sum(megapixels[name] for step in plan.steps for name in step.cameras)
+    cameras, frames = measure_megapixels(rig, plan)
     calibrate_s, reconstruct_s = (
         one["fixed_s"] + one["camera_megapixel_s"] * cameras + one["frame_megapixel_s"] * frames
         for one in (seconds["calibrate"], seconds["reconstruct"])
     )
     return RunTimes(seconds["plan_s"], plan.estimate_duration_s(rig), calibrate_s, reconstruct_s)
+
+
+def measure_megapixels(rig: Rig, plan: Plan) -> tuple[float, float]:
+    """Return the megapixels of a plan's cameras, and those of all its frames.
+
+    Examples
+    --------
+    >>> from capture.plan import flash_plan
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("flash").resized(1000)
+    >>> cameras, frames = measure_megapixels(rig, flash_plan(rig))
+    >>> round(frames / cameras)  # parallel, crossed and four dark frames
+    6
+    """
+    megapixels = {view.name: view.width_px * view.height_px * 1e-6 for view in rig.all_views}
+    used = {name for step in plan.steps for name in step.cameras}
+    frames = sum(megapixels[name] for step in plan.steps for name in step.cameras)
+    return sum(megapixels[name] for name in used), frames
 
 
 def combine_errors(medians: Mapping[str, float]) -> float:

@@ -121,6 +121,17 @@ def test_irreducible_error_is_reported_out_of_reach():
     assert len(chosen.lights) == 30
 
 
+@pytest.mark.parametrize(("informative", "valid"), [(3, False), (4, True)])
+def test_point_needs_four_informative_lights(informative, valid):
+    """Lights that reach a point in its highlight alone leave it without an estimate."""
+    variance = np.full((1, 12), np.inf)
+    variance[0, :informative] = 1e-4
+    found = selection.fisher_information(
+        UP[None], ring(12, 0.5), variance, reaches=np.ones((1, 12), bool)
+    )
+    assert selection.predict_errors(found, range(12), min_lights=10).valid[0] == valid
+
+
 def test_rayleigh_angle_median_matches_samples():
     rng = np.random.default_rng(3)
     scale = np.array([0.1, 0.3, 1.0])

@@ -2,9 +2,12 @@
 
 import pytest
 
+from capture.plan import flash_plan
+from capture.rig import load_rig
 from skinrig.benchmarks import end_to_end
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.cli import main
+from skinrig.planning import confirmation, plans
 
 BUDGETS_S = (20.0, 40.0, 80.0, 160.0)
 
@@ -70,6 +73,32 @@ def test_points_hold_total_seconds_and_mean_error(monkeypatch):
     assert first.extra_values["people"] == 2
     assert first.extra_values["inside the forecast's interval"] == 1
     assert first.extra_values["capture, s"] == pytest.approx(0.5 * BUDGETS_S[0])
+
+
+def test_calibration_is_of_persons_own_rig(monkeypatch):
+    """The dome and the sphere as built depend on the seed of the person."""
+    calibrated, captured = [], []
+
+    def calibrate_simulated(rig, folder, targets, kinds, *, seed):
+        calibrated.append((rig, seed, {one["session_seed"] for one in targets.values()}))
+
+    def capture_choice(choice, folder, *, subject, seed):
+        captured.append((subject, seed))
+        return confirmation.RehearsedCapture({"melanin": (4.0, 1.0)}, 6.0, 7.0)
+
+    monkeypatch.setattr(end_to_end, "calibrate_simulated", calibrate_simulated)
+    monkeypatch.setattr(end_to_end, "calibrate", lambda *args: None)
+    monkeypatch.setattr(end_to_end, "capture_choice", capture_choice)
+    rig = load_rig("flash").resized(64)
+    one, other = (
+        plans.PlanChoice(rig, flash_plan(rig, repeats=count), (), 0.0, {}, ()) for count in (1, 2)
+    )
+    found = list(end_to_end.measure_choices(("IV", 37), [one, other, one], 5.0, 9))
+    # its three targets once each, for both plans
+    assert calibrated == [("flash", 37, {9})] * 3
+    assert captured == [("IV", 37)] * 2  # equal plans once
+    assert [row.times.plan_s for row in found] == [5.0] * 3
+    assert found[0] is found[2]
 
 
 def test_bench_command_measures_selected_rig(monkeypatch, capsys):

@@ -138,7 +138,7 @@ def test_plan_command_keeps_budget(monkeypatch, rig, tmp_path, capsys):
         (["flash", "--budget", "60s", "--bands", "460"], 2, "together with --bands"),
         (["flash", "--budget", "60"], 2, "add the unit"),
         (["flash", "--budget", "0s"], 3, "above 0"),
-        (["dome", "--budget", "60s"], 2, "not an option of the dome rig"),
+        (["dome", "--budget", "60s", "--goals", "normals<=1deg"], 2, "together with --goals"),
     ],
 )
 def test_plan_command_refuses_unusable_budget(argv, code, words, capsys):
