@@ -31,7 +31,13 @@ def main(source: Path, runs: int) -> None:
 
 def _time_clone(source: Path, folder: Path) -> tuple[float, float, float]:
     kept = {key: value for key, value in os.environ.items() if not _is_of_this_python(key)}
-    environment = kept | {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
+    own = str(Path(sys.prefix) / "bin")
+    path = os.pathsep.join(p for p in os.get_exec_path() if p != own)
+    environment = kept | {
+        "HOME": str(folder),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "PATH": path,
+    }
     clone = folder / "skinrig"
     start = time.monotonic()
     subprocess.run(["git", "clone", "--quiet", str(source), str(clone)], check=True)
@@ -49,13 +55,17 @@ def _time_demo(clone: Path, environment: dict[str, str], start: float) -> tuple[
     """Return seconds from the start to the first report with pictures, and to the end."""
     demo = subprocess.Popen(["make", "demo"], cwd=clone, env=environment, stdout=sys.stderr)
     first_s: float | None = None
-    while demo.poll() is None:
+    ended = False
+    while not ended:
+        ended = demo.poll() is not None  # a report of the last moment counts, too
         report = clone / REPORT
         if first_s is None and report.is_file() and PICTURE in report.read_bytes():
             first_s = time.monotonic() - start
-        time.sleep(POLL_S)
-    if demo.returncode or first_s is None:
+        time.sleep(0.0 if ended else POLL_S)
+    if demo.returncode:
         raise SystemExit(f"make demo: got exit code {demo.returncode}; its output is above")
+    if first_s is None:
+        raise SystemExit(f"make demo: {REPORT} got no picture")
     return first_s, time.monotonic() - start
 
 

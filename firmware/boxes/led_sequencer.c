@@ -396,6 +396,7 @@ COMMAND(do_cam_trig) {
 
 COMMAND(do_safe_eyes) {
   (void)answer;
+  enum eyes before = unit.eyes;
   if (equals_word(arguments, P("OPEN")))
     unit.eyes = EYES_OPEN;
   else if (equals_word(arguments, P("CLOSED")))
@@ -405,7 +406,8 @@ COMMAND(do_safe_eyes) {
   else
     return refuse(CODE_SYNTAX, P("expected OPEN or CLOSED or SHIELDED"));
   unit.armed = false;
-  if (unit.eyes == EYES_OPEN) box_go_dark(); /* what runs was judged for eyes that are not open */
+  /* what runs was judged for eyes that were not open */
+  if (unit.eyes == EYES_OPEN && before != EYES_OPEN) box_go_dark();
   return CODE_OK;
 }
 

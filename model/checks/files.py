@@ -21,7 +21,7 @@ MAX_EXPANSION = 1100
 READABLE_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes, and for which `MAX_EXPANSION` holds."""
 HEADER_ERRORS = (
-    *(MemoryError, OverflowError, SyntaxError, TypeError, KeyError, RuntimeError),
+    *(MemoryError, OverflowError, SyntaxError, TypeError, KeyError, RecursionError),
     tokenize.TokenError,
 )
 """What NumPy raises for a damaged header of an array, besides ValueError."""
@@ -132,7 +132,7 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
             return {
                 name: _read_array(found, entry) for name, entry in zip(names, entries, strict=True)
             }
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(f"is not a readable archive: {error}") from error
     except HEADER_ERRORS as error:
         raise ValueError(f"has an unreadable array: {error!r}") from error

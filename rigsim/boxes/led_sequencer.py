@@ -388,9 +388,9 @@ class LedSequencer(Device, Generic[RowT]):
         return f"{token},{self.clock_us(now)}"
 
     def _set_eyes(self, arguments: str, now: float) -> None:
-        self.eyes = parse_choice(arguments, EYE_STATES)
+        before, self.eyes = self.eyes, parse_choice(arguments, EYE_STATES)
         self._sequence_armed = False
-        if self.eyes == "OPEN":  # what runs was judged for eyes that are not open
+        if before != self.eyes == "OPEN":  # what runs was judged for eyes that were not open
             self.go_dark(now)
 
     def _list_failed(self, _: str, now: float) -> str:

@@ -240,8 +240,9 @@ def test_long_judgment_is_answered_last_and_once(judged):
     assert judged_s > 0.2  # without care the LED would have been lit for this long
 
 
-def test_safe_ends_a_long_judgment(judged):
+@pytest.mark.parametrize(("text", "cleared"), [("SAFE", 32 + 1), ("SAFE:EYES OPEN", 32)])
+def test_dark_ends_a_long_judgment(judged, text, cleared):
     _, port, ask_at_once = judged
-    done, late = ask_at_once("SAFE").values()
+    done, late = ask_at_once(text).values()
     assert (done.code, late.code) == (Code.OK, Code.HARDWARE)
-    assert not int(port.ask("STAT?")) & 32 + 1
+    assert not int(port.ask("STAT?")) & cleared

@@ -379,6 +379,15 @@ def test_open_eyes_end_running_sequence(bench):
     assert bench.ask("SEQ:POS?").startswith("STOP,")
 
 
+def test_sequence_for_open_eyes_goes_on_with_them(bench):
+    bench.ask("SYST:ARM")
+    bench.load(rows_of(behind(2)))
+    bench.ask("SEQ:ARM 2")
+    bench.ask("TRIG r1")
+    bench.ask("SAFE:EYES OPEN")
+    assert bench.ask("SEQ:POS?").startswith("RUN,")
+
+
 def test_eye_state_is_cleared_by_brown_out(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
@@ -524,7 +533,7 @@ def test_slow_judgment_is_answered_late_and_once():
     assert bench.ask("SEQ:POS?").startswith("READY")
 
 
-@pytest.mark.parametrize("text", ["SAFE", "*RST"])
+@pytest.mark.parametrize("text", ["SAFE", "*RST", "SAFE:EYES OPEN"])
 def test_dark_ends_a_slow_judgment(text):
     bench, _ = judged_slowly()
     bench.ask(text)
