@@ -2,10 +2,10 @@
 
     python tools/fit_run_times.py dome --width 200 --subject III --seed 750 --budget 45s --plans 5
 
-Plans within the budget are chosen as far apart as possible in the pixels of cameras and frames,
-captured by the simulated rig, calibrated and reconstructed. Printed per plan: pixels, seconds of
-the phases, and errors over their forecasts. Then the nonnegative least-squares fit, the rows of
-`skinrig/data/run_times.toml`. Seconds of computation are processor seconds.
+Plans within the budget are chosen as far apart as possible in the pixels of cameras and frames.
+The simulated rig captures them, then they are calibrated and reconstructed. Printed per plan:
+pixels, seconds of the phases, and errors over their forecasts. Then the nonnegative least-squares
+fit, the rows of `skinrig/data/run_times.toml`. Seconds of computation are processor seconds.
 """
 
 from __future__ import annotations

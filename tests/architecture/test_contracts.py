@@ -118,21 +118,72 @@ def test_a_hidden_none_would_be_found():
         assert none_defaults_without_none(ast.parse(code)) == ["f.a"]
 
 
-def named_modules_of_application(text):
-    """Return names of the application's modules in strings, as of an import at run time."""
-    return re.findall(r"""["'](skinrig\.[\w.]+)["']""", text)
+APPLICATION_IN_STRING = re.compile(
+    r"""["']skinrig\.(?:[\w.{}]*["']|\w*\{)"""  # a module's name, or its beginning
+    r"""|(?:import_module|__import__|find_spec|run_module)\(\s*[fF]?["']skinrig\b"""
+    r"""|-m(?:["'],)?\s*["']?skinrig\b"""  # as a command
+)
+"""A name that an import at run time needs; schemas, versions and advice have others."""
 
 
-def test_packages_work_without_the_application():
+def imports_by_name(text):
+    return "skinrig" in text and APPLICATION_IN_STRING.search(text) is not None
+
+
+def test_packages_do_not_import_application_by_name():
     """The import contracts cover ``import skinrig``; a module's name in a string is another way."""
     paths = modules("capture", "reconstruction", "rigsim", "model")
     assert len(paths) > 400
-    assert [p for p in paths if named_modules_of_application(text_of(p))] == []
+    assert [p for p in paths if imports_by_name(text_of(p))] == []
 
 
-def test_import_of_the_application_by_name_is_found():
-    found = named_modules_of_application('import_module("skinrig.cli")\nSCHEMA = "skinrig.rig/1"')
-    assert found == ["skinrig.cli"]
+@pytest.mark.parametrize(
+    "code",
+    [
+        'import_module("skinrig.cli")',
+        'importlib.import_module(\n    "skinrig"\n)',
+        "__import__('skinrig')",
+        'import_module(f"skinrig.{name}")',
+        'import_module("skinrig." + name)',
+        'names = ["skinrig.fusing.faces"]',
+        'run([sys.executable, "-m", "skinrig", *words])',
+        'run("python -m skinrig doctor", shell=True)',
+    ],
+)
+def test_import_of_application_by_name_is_found(code):
+    assert imports_by_name(code)
+
+
+@pytest.mark.parametrize(
+    "code", ['SCHEMA = "skinrig.rig/1"', 'version("skinrig")', 'ADVICE = "skinrig verify lists it"']
+)
+def test_other_uses_of_the_name_are_allowed(code):
+    assert not imports_by_name(code)
+
+
+@pytest.mark.long
+def test_packages_load_without_the_application():
+    """Each module of the four packages is imported where ``skinrig`` cannot be."""
+    names = [
+        ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for p in modules("capture", "reconstruction", "rigsim", "model")
+    ]
+    code = (
+        "import importlib, sys, warnings\n"
+        "warnings.simplefilter('ignore')\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] == 'skinrig':\n"
+        "            raise ImportError('the application was imported')\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        f"for name in {names!r}:\n"
+        "    try:\n"
+        "        importlib.import_module(name)\n"
+        "    except ImportError as error:\n"
+        "        assert 'application' not in str(error), name\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
 
 
 @pytest.mark.parametrize("module", ["capture", "capture.session", "capture.devices.flash"])

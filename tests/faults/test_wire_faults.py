@@ -211,13 +211,35 @@ def test_same_seed_gives_same_bytes_at_same_times(world, ledger):
     assert transcript(1) != transcript(2)
 
 
-def test_virtual_time_runs_faster_than_the_wall(world, ledger):
+@pytest.fixture
+def refused_sleep(monkeypatch):
+    """Make each sleep in real time an error, however busy the machine is."""
+
+    def refuse(seconds):
+        raise AssertionError(f"sleeps {seconds} s in real time")
+
+    monkeypatch.setattr(time, "sleep", refuse)
+
+
+@pytest.mark.usefixtures("refused_sleep")
+def test_virtual_time_passes_without_sleep(world, ledger):
     simulated, url = world()
     host = ledger(simulated, url)
     host.open()
-    started = time.process_time()  # the time of other processes does not count
+    started = time.process_time()  # of a world that reads a real clock until it is late enough
     for _ in range(60):
         host.pop()
     # 60 pops at 20 a minute last over two minutes
     assert simulated.now > 110.0
     assert simulated.now > 10.0 * (time.process_time() - started)
+
+
+@pytest.mark.usefixtures("refused_sleep")
+def test_sleep_in_real_time_would_be_found(ledger):
+    simulated = World(RIG, clock="real")
+    host = ledger(simulated, f"sim://flash?world={simulated.register(next(NAMES))}")
+    try:
+        with pytest.raises(AssertionError, match="in real time"):
+            host.open()
+    finally:
+        simulated.unregister()

@@ -74,9 +74,9 @@ def test_kernel_sum_matches_plain_numpy_over_dense_plane(table, prior, rng):
 
 
 def test_intervals_cover_68_percent_of_prior_skin(table, prior, rng):
-    # 6000 independent pixels: binomial standard error 0.006; 4 of them are 0.024, the rest is for
-    # bins and for blood that is drawn from a narrower range than the prior has.
-    c_m, c_hd, shading = skin(rng, 6000, prior)
+    # 12000 independent pixels: binomial standard error 0.0043; 4 of them are 0.017, the rest is for
+    # bins and for blood that is drawn from a narrower range than the prior has (0.012 of 24000).
+    c_m, c_hd, shading = skin(rng, 12_000, prior)
     rgb = seen(table, c_m, c_hd, shading, rng)
     found = estimate(rgb, table, prior=prior, variance=(NOISE * rgb) ** 2)
     covered = np.abs(found.melanin - c_m) <= found.stderr_melanin

@@ -37,8 +37,16 @@ def test_maps_export_requires_subject_consent_and_valid_date(measured, tmp_path,
         with pytest.raises(ConsentError, match="P042 has not agreed"):
             export(use=use, today=today)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["measured"]
-    if to != "merl":  # tables of 35 MB, which tests of their format write
+    if to != "merl":  # tables of 35 MB, see the long test
         assert export(use="research", today=LAST).files > 0
+
+
+@pytest.mark.long
+def test_merl_tables_are_exported_within_the_consent(measured, tmp_path):
+    out = tmp_path / "out"
+    made = exporting.export(measured, out, to="merl", now=NOW, use="research", today=LAST)
+    tables = list(out.rglob("*.binary"))
+    assert 0 < len(tables) < made.files
 
 
 @pytest.mark.parametrize("to", ["mtlx", "gltf", "usd"])

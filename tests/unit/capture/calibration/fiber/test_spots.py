@@ -55,7 +55,7 @@ def test_displaced_spots_on_rotated_row_found_within_errors(row):
     assert np.abs(camera.nominal - camera.places).max() > 1
 
 
-@pytest.mark.parametrize("shift", [(5.0, 5.0), (-15.0, 8.0)])
+@pytest.mark.parametrize("shift", [(5.0, 5.0), (-5.0, -5.0), (-15.0, 8.0)])
 def test_row_shifted_as_whole_is_found(rng, fiber_camera, falling, shift):
     camera = fiber_camera(rng, shift=shift)
     spots = find(camera, falling)

@@ -130,7 +130,7 @@ def test_gain_error_falls_with_root_of_pixel_count():
 
 
 def test_the_variance_follows_the_line_of_photon_transfer(calibrations):
-    """chi2/dof of about 500 blocks has a standard deviation near 0.06; 60 x 3 of them average."""
+    """chi2/dof of about 500 blocks has a standard deviation near 0.06; 36 x 3 of them average."""
     chi2 = np.array([c.chi2_per_dof for c in calibrations])
     assert abs(chi2.mean() - 1.0) < 0.05
 

@@ -8,7 +8,7 @@ import pytest
 
 from capture.rig import load_rig
 from rigsim.as_built.polarizers import IDEAL_POLARIZERS
-from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, ActualSphere, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.sampled_patch import SampledPatch
@@ -19,7 +19,7 @@ from rigsim.scenes.gradient.target import FLAT_REFLECTANCE
 from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from rigsim.scenes.gradient.truth import scene_surface
 from rigsim.sensor import fixed_pattern
-from rigsim.skin_patch.microrelief import make_micro_skin
+from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.motion import PatchMotion
 from rigsim.world.taped_skin import GripState
 
@@ -42,15 +42,23 @@ def rig():
     return load_rig("gradient").cropped(SIDE)
 
 
+def key_of(value):
+    """Return a key that differs where any field of a window or of its sphere does."""
+    if isinstance(value, SampledPatch | ActualSphere):
+        return tuple(key_of(getattr(value, field.name)) for field in dataclasses.fields(value))
+    if isinstance(value, MicroSkin):
+        return id(value)
+    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+
 @pytest.fixture(scope="module", autouse=True)
 def patches_sized_once():
-    """Compute the effects' sizes once for the scenes of a patch in the same light and camera."""
+    """Compute the effects' sizes once for scenes that are equal in all that the sizes depend on."""
     sized = {}
     compute = SampledPatch.changes_over_noise
 
     def look_up(window, white, noise, built):
-        light = window.sphere.intensity.tobytes(), window.view, window.lens
-        asked = id(window.patch), *light, white, noise, tuple(built.items())
+        asked = (*key_of(window), white, noise, *built.items())
         if asked not in sized:  # the patch is kept, so that no other has its id
             sized[asked] = window.patch, compute(window, white, noise, built)
         return sized[asked][1]
@@ -255,17 +263,15 @@ def test_invalid_scene_requests_are_refused(rig, skin, scene):
         GradientScene(rig, "cube")
 
 
-def test_unaffordable_patches_name_the_fast_renderer(rig, skin, monkeypatch):
+def test_unaffordable_patches_name_the_fast_renderer(rig, skin):
     """What Mitsuba does not render falls back with the reason; it never differs silently."""
     smooth = dataclasses.replace(skin, alpha=np.full_like(skin.alpha, 0.01))
-    full, flat = load_rig("gradient"), GradientScene(rig, "flat")
-    effects = GradientScene(rig, skin).needs  # the same for all: the choice follows other facts
-    monkeypatch.setattr("rigsim.scenes.gradient.scene.select_gradient_effects", lambda *_: effects)
+    full = load_rig("gradient")
     for made, why in (
         (GradientScene(full, skin), "3.3e+08 shadow rays per state exceed 2.5e+07"),
         (GradientScene(rig, skin, sectors=16), "sectors: requested settings of the fast renderer"),
         (GradientScene(rig, smooth), "roughness 0.01 is below 0.02"),
-        (flat, "closed forms render the target flat"),
+        (GradientScene(rig, "flat"), "closed forms render the target flat"),
         (GradientScene(rig, skin, choice=choose_renderer("fast")), "requested"),
     ):
         assert (made.variant.renderer, made.variant.why) == ("fast", why)
