@@ -302,19 +302,29 @@ class LensImage:
         Parameters
         ----------
         light
-            Radiance of each sample by channel and light, shape (C, n, `MOSAIC_LIGHTS`).
+            Radiance of each sample by channel and light, shape (C, n, L) with one light or
+            `MOSAIC_LIGHTS`.
         cell
             Channels of the sensor's 2 x 2 cell, below C, shape (2, 2).
 
         Returns
         -------
         ndarray of float32
-            Shape (H, W, `MOSAIC_LIGHTS`), the same numbers as those of `render`.
+            Shape (H, W, L), the same numbers as those of `render`.
+
+        Raises
+        ------
+        BlurError
+            For another number of lights.
         """
-        out = np.zeros((*self.shape, MOSAIC_LIGHTS), np.float32)
+        lights = light.shape[2]
+        if lights not in (1, MOSAIC_LIGHTS):
+            raise BlurError(f"light: got {lights} lights, expected 1 or {MOSAIC_LIGHTS}")
+        out = np.zeros((*self.shape, lights), np.float32)
         if light.size:
             weights, toward = self.spread.table, self._samples[4]
-            kernels.gather_mosaics(
+            sum_lights = kernels.gather_mosaic if lights == 1 else kernels.gather_mosaics
+            sum_lights(
                 *self._weight_places(),
                 toward,
                 weights.reshape(-1),

@@ -9,7 +9,8 @@ DEPTH_GAP_BINS: Final = 64
 """Number of depth bins in the search for a gap."""
 
 MOSAIC_LIGHTS: Final = 8
-"""Lights whose samples `gather_mosaics` sums at once: a pixel's weights serve them all."""
+"""Lights whose samples `gather_mosaics` sums at once: a pixel's weights serve them all.
+`gather_mosaic` sums those of one."""
 
 
 @njit(parallel=True, cache=True)
@@ -139,3 +140,26 @@ def gather_mosaics(  # type: ignore[no-untyped-def]
             found = out[y, x]
             found[0], found[1], found[2], found[3] = a, b, c, d
             found[4], found[5], found[6], found[7] = e, f, g, h
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def gather_mosaic(  # type: ignore[no-untyped-def]
+    starts, weight_index, toward, weights, per_pixel, radius, cut, far, light, cell, out
+):
+    """Do as `gather_mosaics` for one light, which takes less time than eight."""
+    height, width = cut.shape
+    wide = 2 * radius + 1
+    for y in prange(height):
+        for x in range(width):
+            column = light[cell[y % 2, x % 2]]
+            edge, behind = cut[y, x], far[y, x]
+            total = np.float32(0.0)
+            left, right = max(x - radius, 0), min(x + radius + 1, width)
+            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
+                shift = per_pixel * ((v - y + radius) * wide + radius - x)
+                for sample in range(starts[v * width + left], starts[v * width + right]):
+                    i = np.uint64(sample)
+                    w = weights[np.uint64(weight_index[i] + shift)]
+                    w *= behind if toward[i] < edge else np.float32(1.0)
+                    total += w * column[i, 0]
+            out[y, x, 0] = total

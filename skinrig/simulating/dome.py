@@ -113,23 +113,28 @@ def _expect_images(
 ) -> AbstractContextManager[None]:
     """Let a scene render lights in groups, and ahead of their requests where memory is too small.
 
-    Images ahead are in a file, which takes half of the space that the session leaves.
+    Images ahead are in a file until their last request. It takes up to half of the space that the
+    session leaves; without that space images are rendered again.
     """
     if order.target is not None:
         return nullcontext()
-    lit = dict.fromkeys(light for step in plan.steps for light in step_lights(step))
     number = {light.name: k for k, light in enumerate(rig.lights)}
-    scene.expect_channels([number[name] for name in lit])
-    pixels = [view.width_px * view.height_px for view in rig.views]
-    largest, total = (np.dtype(np.float32).itemsize * n for n in (max(pixels), sum(pixels)))
-    fits = largest <= SMALL_IMAGE_BYTES and total * len(lit) <= IMAGE_CACHE_BYTES
+    requests = [
+        (camera, number[light])
+        for step in plan.steps
+        for camera in step.cameras
+        for light in step_lights(step)
+    ]
+    scene.expect_requests(requests)
+    pixels = {view.name: view.width_px * view.height_px for view in rig.all_views}
+    sizes = [np.dtype(np.float32).itemsize * pixels[camera] for camera, _ in set(requests)]
+    fits = max(sizes, default=0) <= SMALL_IMAGE_BYTES and sum(sizes) <= IMAGE_CACHE_BYTES
     if fits or order.move:
         return nullcontext()
     need = forecast_resources("simulate dome", count_megapixels(rig, plan))
     free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
     folder, most_bytes = order.out.parent, max(0, int(free) // 2)
-    names = [view.name for view in rig.views]
-    return cast(AbstractContextManager[None], scene.images.render_ahead(names, folder, most_bytes))
+    return cast(AbstractContextManager[None], scene.images.render_ahead(folder, most_bytes))
 
 
 def _manifest_settings(

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Final, TypeAlias
 
-from numba import get_num_threads, set_num_threads
+from numba import get_num_threads, set_num_threads, threading_layer
 
 logger = logging.getLogger(__name__)
 
@@ -17,11 +17,15 @@ CameraLights: TypeAlias = tuple[str, tuple[int, ...]]
 THREAD_NAME: Final = "images of lights"
 """Name of the thread."""
 
+CONCURRENT_LAYERS: Final = ("omp", "tbb")
+"""Numba's threading layers whose kernels several threads may call at once; others abort."""
+
 
 class RenderAhead:
     """Thread that renders groups of images in order while their requests are served.
 
-    Only one thread renders at a time. A request that needs a renderer goes first.
+    Only one thread renders at a time. A request that needs a renderer goes first. Without one of
+    `CONCURRENT_LAYERS` nothing is rendered ahead.
 
     Parameters
     ----------
@@ -32,22 +36,21 @@ class RenderAhead:
 
     Examples
     --------
-    >>> done = []
-    >>> with RenderAhead([("C00", (0,)), ("C00", (1,))], done.append) as ahead:
+    >>> rendered = threading.Event()
+    >>> with RenderAhead([("C00", (0,)), ("C00", (1,))], lambda group: rendered.set()) as ahead:
     ...     ahead.begin_after(("C00", (0,)))
-    ...     ahead.wait()
-    >>> done
-    [('C00', (1,))]
+    ...     rendered.wait(10.0)
+    True
     """
 
     def __init__(
         self, groups: Sequence[CameraLights], render: Callable[[CameraLights], object]
     ) -> None:
-        self._groups, self._render = tuple(groups), render
-        self._next = len(self._groups)
+        self._threads = get_num_threads()  # starts them, which chooses their layer
+        self._groups = tuple(groups) if threading_layer() in CONCURRENT_LAYERS else ()
+        self._render, self._next = render, len(self._groups)
         self._changed = threading.Condition()
         self._is_busy, self._is_stopped, self._waiting = False, False, 0
-        self._threads = get_num_threads()
         self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
 
     def __enter__(self) -> "RenderAhead":
@@ -74,34 +77,31 @@ class RenderAhead:
                 self._next = self._groups.index(group) + 1
                 self._changed.notify_all()
 
-    def wait(self) -> None:
-        """Wait until all groups after the beginning are rendered."""
-        with self._changed:
-            self._changed.wait_for(lambda: not self._is_busy and self._next == len(self._groups))
-
     @contextmanager
     def exclusive(self) -> Iterator[None]:
         """Render nothing ahead meanwhile."""
         with self._changed:
             self._waiting += 1
-            self._changed.wait_for(lambda: not self._is_busy)
-        try:
-            yield
-        finally:
-            with self._changed:
+            try:
+                self._changed.wait_for(lambda: not self._is_busy)
+                yield
+            finally:
                 self._waiting -= 1
                 self._changed.notify_all()
 
     def _run(self) -> None:
         set_num_threads(self._threads)
         while (group := self._take()) is not None:
+            is_rendered = False
             try:
                 self._render(group)
+                is_rendered = True
             except Exception as error:  # the request of an image renders it again, and raises this
-                logger.warning("images are rendered when they are requested: %s", error)
-                self._finish(rest=False)
-            else:
-                self._finish(rest=True)
+                logger.warning(
+                    "images are rendered when they are requested: %s", error, exc_info=True
+                )
+            finally:
+                self._finish(rest=is_rendered)
 
     def _take(self) -> CameraLights | None:
         """Wait for the next group; None at the end."""

@@ -191,11 +191,12 @@ class MitsubaScene:
                 apply_cfa(self.render(seen, one.light, one.color, one.added()), cfa)
                 for one in lights
             ]
-        size = 3 * count * MOSAIC_LIGHTS
+        lanes = 1 if len(lights) == 1 else MOSAIC_LIGHTS
+        size = 3 * count * lanes
         if self._memory.size < size:
             self._memory = np.zeros(size, np.float32)
         # other lights in places that are not used make images that are not used
-        rows = self._memory[:size].reshape(3, count, MOSAIC_LIGHTS)
+        rows = self._memory[:size].reshape(3, count, lanes)
         for k, one in enumerate(lights):
             parts = self._shade(seen, one.light, one.added())
             for part, (_, place) in zip(parts, seen.image_hits.parts(), strict=True):

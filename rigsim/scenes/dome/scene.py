@@ -15,7 +15,7 @@ was built (`rigsim.as_built.dome`): with other positions and powers, distorted i
 responses, dead LEDs and crossed wires.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -386,10 +386,11 @@ class DomeScene(FaceScene):
         layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
         return dilate_texture(layers, self._face().atlas.covered)
 
-    def expect_channels(self, channels: Sequence[int]) -> None:
-        """Render the lights of channels in groups, in this order; not of a head that moves."""
+    def expect_requests(self, requests: Iterable[tuple[str, int]]) -> None:
+        """Render requests in groups, by camera and channel, in order; not of a head that moves."""
         if self._rows.is_still:
-            self.images.expect([self.dome.light_of_channel(channel) for channel in channels])
+            light = self.dome.light_of_channel
+            self.images.expect((camera, light(channel)) for camera, channel in requests)
 
     def _mosaics(self, view_name: str, lights: Sequence[int], t_s: float) -> list[Float32Array]:
         """Return the light behind each pixel's filter, (H, W), of up to `MOSAIC_LIGHTS` lights."""

@@ -257,6 +257,8 @@ def test_mosaics_have_channels_of_each_image(rig):
         mosaics = lens.render_mosaics(light, filter_channels(cfa))
         for k, image in enumerate(images):
             assert np.array_equal(mosaics[..., k], apply_cfa(image, cfa))
+        one = lens.render_mosaics(light[..., 3:4], filter_channels(cfa))
+        assert np.array_equal(one, mosaics[..., 3:4])
     assert not np.array_equal(mosaics[..., 0], apply_cfa(images[0], "RGGB"))
 
 
@@ -264,6 +266,8 @@ def test_mosaics_without_samples_are_dark(rig):
     lens = planes(wide_open(rig, 2.0), np.full((8, 8), np.nan))
     dark = np.zeros((3, 0, MOSAIC_LIGHTS), np.float32)
     assert not lens.render_mosaics(dark, filter_channels("RGGB")).any()
+    with pytest.raises(BlurError, match="light: got 2"):
+        lens.render_mosaics(dark[..., :2], filter_channels("RGGB"))
 
 
 def test_weights_of_plain_sum_agree_with_kernel(rig):

@@ -3,16 +3,19 @@
 import itertools
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, verify
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.cli import main
+from skinrig.simulating import dome
 from skinrig.simulating.dome import farthest_point_sample, small_dome
-from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.orders import DomeOrder, SimulationError
 from skinrig.simulating.simulation import simulate_session
 
 DOME = load_rig("dome")
@@ -179,3 +182,23 @@ def test_face_session_contains_scan_and_separate_truth(tmp_path):
     bright = session.read(session.frames("olat", exposure=0)[0]).cfa
     dark = session.read(session.frames("dark", exposure=0)[0]).cfa
     assert bright.mean() > dark.mean()
+
+
+def test_scene_expects_lights_of_each_steps_cameras(monkeypatch, tmp_path):
+    """One camera per light, and one step of two lights; images exceed the memory's cache."""
+    rig = small_dome(DOME, lights=3, views=2, width_px=1300)
+    (a, b, c), (left, right) = (tuple(one.name for one in rows) for rows in (rig.lights, rig.views))
+    steps = (
+        Step("D", "dark", {}, {}, (left, right)),
+        Step("O1", "olat", {}, {"light": c}, (left,)),
+        Step("O2", "olat", {}, {"light": a}, (right,)),
+        Step("T", "tracking", {}, {"leds": f"{b}+{c}"}, (left, right)),
+    )
+    expected, files = [], []
+    images = SimpleNamespace(render_ahead=lambda folder, most_bytes: files.append(folder))
+    scene = SimpleNamespace(expect_requests=expected.extend, images=images)
+    order = DomeOrder(out=tmp_path)
+    dome._expect_images(scene, order, rig, Plan("dome", steps))
+    twice = [(left, 1), (left, 2), (right, 1), (right, 2)]
+    assert expected == [(left, 2), (right, 0), *twice]
+    assert files == [tmp_path.parent]
