@@ -38,7 +38,7 @@ N_RIM_NEIGHBORS: Final = 8
 SCAN_NOISE_MM: Final = 0.12
 """Error across the surface of 68 % of the scanned vertices at rims of up to 40 mm.
 
-It was measured on the same scans."""
+It was measured on scans of seeds 0 to 7."""
 MAX_EDGE_FRACTION: Final = 0.25
 """Longest edge of a rim over its length above which the edges of the disc are made more equal."""
 MAX_CHORD_FRACTION: Final = 0.4
