@@ -2,14 +2,23 @@
 
     python tools/judge_simulated_faces.py [--seeds 2] [--size-px 256]
 
-Three tables: per region, the 90th percentile of the gradient of log R_d where the region begins,
-over the 99th percentile of the gradient of the skin elsewhere, the largest over bands and people
-(limit 1; the border of lips is anatomy); per skin type, the part of `N_SPOTS` spots of the face
-whose lightness, chroma and hue lie within 1 to 99 % (limit 95 % of the spots) and 5 to 95 % of
-measured skin of their band of the typology angle; per site of microrelief, the RMS slope over that
-of Beckmann facets which fit measured faces (Weyrich et al. 2006, doi:10.1145/1141911.1141987; limit
-20 %), and how its variance is distributed over wavelengths. The exit status is 1 if a limit is
-missed.
+It prints three tables:
+
+1. Per region, the 90th percentile of the gradient of log R_d at its border, over the 99th
+   percentile elsewhere. It is the largest over bands and people. The limit is 1; the border of lips
+   is anatomy and has none.
+2. Per skin type, the part of `N_SPOTS` spots with lightness, chroma and hue within 1 to 99 % of
+   measured skin, and within 5 to 95 %. Measured skin is of the same band of the typology angle. The
+   limit of the first part is 95 %.
+3. Per site of microrelief, the RMS slope over that of Beckmann facets that fit measured faces, and
+   the distribution of its variance over wavelengths. The slope's limit is 20 %.
+
+The exit status is 1 if a limit is missed.
+
+References
+----------
+Weyrich et al. 2006, Analysis of human faces using a measurement-based skin reflectance model,
+doi:10.1145/1141911.1141987.
 """
 
 from __future__ import annotations

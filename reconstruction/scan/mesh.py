@@ -51,8 +51,8 @@ class RefinedScan:
     stderr_mm: Float32Array | None = None
     """Standard error across the surface at each point, shape (P,); None: not known."""
     hole_stderr_mm: Float32Array | None = None
-    """Standard error across the surface of points in closed holes, 0 elsewhere, shape (P,); None:
-    all points are scanned."""
+    """Standard error across the surface of points in closed holes and at their rims, 0 elsewhere,
+    shape (P,); None: no hole was closed with a stated error."""
     hole_faces: BoolArray | None = None
     """Triangles of `coarse` that close holes, shape (F,); None: none."""
 
@@ -113,7 +113,8 @@ def load_ply(data: bytes) -> TriangleMesh:
 def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
     """Crop and repair a scan, close its holes, unwrap and refine it.
 
-    A scan with texture coordinates keeps its holes, as their texture is not known.
+    A scan with texture coordinates keeps its long holes, as their texture is not known. Its holes
+    of up to 40 mm around are closed by flat triangles, without a stated error.
 
     Parameters
     ----------
@@ -134,12 +135,15 @@ def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> Refine
         Where no part of the scan is usable.
     """
     mesh = load_ply(scan) if isinstance(scan, bytes) else scan
-    mesh, report = repair_mesh(crop(mesh, box_mm=FACE_BOX_MM))
-    if mesh.corner_uv is not None:
+    face = crop(mesh, box_mm=FACE_BOX_MM)
+    if face.corner_uv is not None:
+        mesh, report = repair_mesh(face)
         return refine_mesh(mesh, points=points, report=report)
+    mesh, report = repair_mesh(face, max_hole_mm=0.0)  # patches have a stated error, fans do not
     closed = close_scan(mesh)
+    errors = closed.corner_stderr_mm()
     refined = refine_mesh(
-        unwrap_mesh(closed.mesh), points=points, report=report, hole_stderr_mm=closed.stderr_mm
+        unwrap_mesh(closed.mesh), points=points, report=report, hole_stderr_mm=errors
     )
     if not closed.rims_mm:
         return replace(refined, hole_stderr_mm=None)
@@ -205,7 +209,7 @@ def refine_mesh(
     """Refine a clean surface by Loop subdivision to about `points` points.
 
     Texture coordinates are refined linearly: each half of an edge is half of it in the texture. So
-    are the standard errors of vertices in closed holes, shape (V,).
+    are the standard errors of corners in closed holes, shape (F, 3); the rim has those of its hole.
 
     References
     ----------
@@ -219,8 +223,8 @@ def refine_mesh(
     steps = max(round(float(np.log(points / len(mesh.vertices_mm)) / np.log(4.0))), 0)
     fine = mesh
     if hole_stderr_mm is not None:  # as a third coordinate of each corner
-        errors = hole_stderr_mm[mesh.faces][..., None]
-        fine = replace(mesh, corner_uv=np.concatenate([mesh.corner_uv, errors], axis=-1))
+        errors = [mesh.corner_uv, hole_stderr_mm[..., None]]
+        fine = replace(mesh, corner_uv=np.concatenate(errors, axis=-1))
     fine = _split_chords(fine)
     for _ in range(steps):
         uv = fine.corner_uv
@@ -235,7 +239,7 @@ def refine_mesh(
     stderr = None
     if hole_stderr_mm is not None:
         stderr = np.zeros(len(fine.vertices_mm), np.float32)
-        stderr[fine.faces] = uv[..., 2]
+        np.maximum.at(stderr, fine.faces, uv[..., 2].astype(np.float32))
     return RefinedScan(
         fine.vertices_mm.astype(np.float32),
         fine.normals(),

@@ -185,7 +185,7 @@ def fuse_sources(
     carried = [name for name in maps if name not in FUSED_MAPS]
     position = base.appearance.maps.get("position")
     fused, p_value = estimate_maps(measured, person, errors, position=position, progress=report)
-    fused = fill_skin(fused, position)
+    fused = fill_skin(fused, position, next((maps[n] for n in NORMAL_MAPS if n in maps), None))
     maps = {name: maps[name] for name in carried}
     if position is not None:
         for name in [name for name in NORMAL_MAPS if name in maps]:

@@ -14,7 +14,9 @@ MEASURED_SUFFIX: Final = "_measured"
 N_NEIGHBORS: Final = 12
 """Measured texels around a gap's texel whose normals give its error."""
 MAX_GAP_DISTANCE_MM: Final = 12.0
-"""Texels farther from the next measured one stay masked: errors were not measured beyond."""
+"""Texels farther from the next measured one stay masked: errors were not measured beyond.
+
+See docs/validation/fusion.md; maps without measured errors have a limit of their own."""
 SPREAD_FACTOR: Final = 0.46
 """Standard error of a filled normal over the spread of the measured normals around it.
 

@@ -14,7 +14,7 @@ from model.checks import Checks
 from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
-from reconstruction.arrays import Float64Array
+from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline.dome.calibrated import CalibratedDome
@@ -40,7 +40,7 @@ CHUNK_SAMPLES: Final = 1_500_000
 """Samples per chunk; about 60 bytes each."""
 
 BASIS_POINTS: Final = 5_000
-"""Randomly drawn points from which the mixtures are estimated."""
+"""Randomly drawn scanned points from which the mixtures are estimated."""
 
 
 def weight_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
@@ -100,23 +100,38 @@ class SurfaceSampleStore:
         return [PointValues.concatenate(each) for each in zip(*found, strict=True)]
 
 
+def draw_basis_points(valid: BoolArray, patch_stderr_mm: FloatArray) -> Int64Array:
+    """Draw valid points outside of closed holes, at most `BASIS_POINTS`, in ascending order.
+
+    Parameters
+    ----------
+    valid
+        (P,): points with an albedo.
+    patch_stderr_mm
+        (P,): standard error by closed holes, 0 where the surface is scanned. In holes, errors of
+        the surface turn half vectors.
+    """
+    good = np.flatnonzero(valid & (patch_stderr_mm == 0.0))
+    return np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
+
+
 def fit_lobes(
     inputs: Inputs,
+    surface: RefinedScan,
     lumitexels: SurfaceSampleStore,
     point_normals: PointValues,
     point_r_d: PointValues,
 ) -> Mapping[str, Any]:
-    """Fit basis BRDFs to some points and reduce them to the rank; return basis and file."""
+    """Fit basis BRDFs to some scanned points and reduce them to the rank; return basis and file."""
     folder = inputs.basis
     materials = brdf_tables.default_basis() if folder is None else brdf_tables.load(folder)
     rank = inputs.rank or BASIS_RANK
-    good = np.flatnonzero(point_r_d.valid)
-    if len(good) < rank:
+    drawn = draw_basis_points(point_r_d.valid, surface.patch_stderr_mm)
+    if len(drawn) < rank:
         raise InputsError(
-            f"lobes: got {len(good)} points with an albedo, expected at least {rank}; choose a "
-            "lower rank, or capture more lights [SR-REC-012]"
+            f"lobes: got {len(drawn)} scanned points with an albedo, expected at least {rank}; "
+            "choose a lower rank, or capture more lights [SR-REC-012]"
         )
-    drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
 
     def fit_drawn(part: slice) -> Float64Array:
         points = drawn[part]

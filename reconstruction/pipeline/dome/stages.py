@@ -55,7 +55,7 @@ STAGE_REVISION = 9
 SCAN_FILE: Final = "scan.ply"
 HOLE_MAP: Final = "hole_stderr"
 """Map of the standard error of the surface in closed holes of the scan."""
-HOLE_NOTE: Final = "standard error across the surface in closed holes of the scan; 0: scanned"
+HOLE_NOTE: Final = "standard error across the surface in closed holes of the scan; 0: elsewhere"
 MEMORY_BYTES: Final = 2**30
 """Sample tables above this size are stored in files, not in memory."""
 FACE_AREA_MM2: Final = 60_000.0
@@ -96,7 +96,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     )
     refused = "" if dome.absolute else unscaled
     seen, turned = "surface lumitexels texture", "surface lumitexels point_normals texture"
-    lit, lobes = "lumitexels point_normals point_r_d", "basis basis_file"
+    lit, lobes = "surface lumitexels point_normals point_r_d", "basis basis_file"
     refined = f"normals_refined {weights} lobe_residual {BASIS_FILE}"
     view, light = inputs.session.rig.views[0], inputs.session.rig.lights[0]
     spectra = {"camera": view.spectral_sensitivity, "illuminant": light.illuminant}
@@ -111,12 +111,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage(
             "lobes", lit, lobes, partial(fit_lobes, inputs), rank=rank, ranks=list(RECORDED_RANKS)
         ),
-        stage(
-            "refined normals",
-            f"surface {lit} {lobes} texture",
-            refined,
-            partial(refine_normals, dome),
-        ),
+        stage("refined normals", f"{lit} {lobes} texture", refined, partial(refine_normals, dome)),
         stage("skin reflectance", "r_d", tone.REFLECTANCE_PRODUCT, tone.reflectance_of_albedo),
         stage("erythema", tone.REFLECTANCE_PRODUCT, "erythema_index", tone.erythema_map),
         # cameras of a dome are not calibrated by a chart: their nominal sensitivities are used

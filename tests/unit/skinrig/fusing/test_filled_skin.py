@@ -64,6 +64,33 @@ def test_fill_skin_far_from_measured_stays_masked():
     assert found.mask[~disc(10.0)].all()
 
 
+def test_translucency_is_filled_within_four_millimeters():
+    maps, _ = skin(disc(20.0))
+    found = fill_skin({"translucency": maps["r_d"]}, points())["translucency"]
+    assert not found.mask[disc(15.0)].any()
+    assert found.mask[~disc(17.0)].all()
+
+
+def test_fill_skin_ignores_texels_facing_away():
+    """Two lips 1 mm apart: a gap of the lower one is filled from the lower one alone."""
+    at = np.arange(SIDE) - SIDE / 2
+    x, y = np.meshgrid(at, at)
+    upper = y >= 0.0
+    folded = SkinMap(np.stack([x, np.abs(y), upper * 1.0], axis=-1), "mm")
+    up = np.where(upper, -1.0, 1.0)
+    normals = SkinMap(np.stack([0.0 * x, 0.0 * x, up], axis=-1), "1")
+    gap = disc(3.0, (0.0, -20.0))
+    values = np.where(gap, 0.0, np.where(upper, 0.8, 0.2))
+    maps = {"melanin": SkinMap(values, MAP_UNITS["melanin"], STATED * values, ~gap)}
+    found = fill_skin(maps, folded, normals)["melanin"]
+    np.testing.assert_allclose(found.values[gap], 0.2)
+    mixed = fill_skin(maps, folded)["melanin"]
+    assert mixed.values[gap].max() > 0.4
+    turned = SkinMap(np.where(gap[..., None], -normals.values, normals.values), "1")
+    alone = SkinMap(values, MAP_UNITS["melanin"], STATED * values, ~gap & ~upper)
+    assert not fill_skin({"melanin": alone}, folded, turned)["melanin"].mask[gap].any()
+
+
 @pytest.mark.parametrize("radius_mm", [-1.0, 200.0])
 def test_fill_skin_without_gap_or_neighbors_changes_nothing(radius_mm):
     maps, _ = skin(disc(radius_mm))
