@@ -58,6 +58,8 @@ class Progress:
     """Seconds that were left, and the clock then."""
     _counted: tuple[str, int, float] | None = None
     """First part of a counted step: name of the step, number and clock."""
+    _last_number: int = 0
+    """Number of the latest part; a smaller one begins another round."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def begin(self, text: str, left_s: float | None = None) -> None:
@@ -90,8 +92,9 @@ class Progress:
     def _left_by_count(self, text: str, number: int, total: int, now: float) -> float | None:
         """Estimate the seconds that are left by the pace of the parts so far."""
         step = self._step(text)
-        if self._counted is None or self._counted[0] != step or number < self._counted[1]:
+        if self._counted is None or self._counted[0] != step or number < self._last_number:
             self._counted = step, number, now
+        self._last_number = number
         _, first, began_s = self._counted
         if number <= first or total < number:
             return None

@@ -38,6 +38,15 @@ def test_counted_parts_estimate_seconds_left():
     assert [event["seconds"] for event in events] == [0.0, 3.0, 6.0, 9.0, 12.0]
 
 
+def test_next_round_of_parts_has_its_own_pace():
+    """A second round, which begins beyond the first part, is twice as fast: 5 of 10 s are left."""
+    lines, clock, stream = progress(as_json=True)
+    for number, step_s in ((1, 2.0), (5, 8.0), (10, 10.0), (3, 0.0), (5, 2.0)):
+        clock.now += step_s
+        lines.begin(f"{number}/10 rows")
+    assert json.loads(stream.getvalue().splitlines()[-1])["left_s"] == 5.0
+
+
 def test_text_skips_parts_that_follow_at_once():
     lines, clock, stream = progress()
     lines.begin("lobes", left_s=30.0)
