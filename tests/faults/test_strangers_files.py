@@ -118,7 +118,7 @@ ATTACKS = {
     "npz holds a pickle": ("npz", lambda good: npz_of(OBJECTS, PICKLE)),
     "npy declares terabytes": ("npy", lambda good: npy_of(HUGE)),
     "npy holds a pickle": ("npy", lambda good: npy_of(OBJECTS, PICKLE)),
-    "npz header is no text of Python": ("npz", lambda good: npz_of(HUGE.replace("}", "("))),
+    "npz header with a syntax error": ("npz", lambda good: npz_of(HUGE.replace("}", "("))),
     "npz has a name twice": ("npz", lambda good: twice()),
     "npz negative shape": ("npz", lambda good: npz_of(HUGE.replace("109", "-109"))),
     "npz blend shapes pickle": ("npz blend shapes", lambda good: npz_of(OBJECTS, PICKLE)),

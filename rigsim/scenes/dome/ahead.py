@@ -4,7 +4,6 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Final, TypeAlias
 
 from numba import get_num_threads, set_num_threads, threading_layer
@@ -58,12 +57,7 @@ class RenderAhead:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop after the group that is being rendered."""
         with self._changed:
             self._is_stopped = True
