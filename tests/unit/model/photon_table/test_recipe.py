@@ -10,13 +10,13 @@ import pytest
 from model.tissue_optics import adding_doubling
 
 pytestmark = pytest.mark.long  # compiles the walk
-PATH = Path(__file__).parents[4] / "tools" / "make_photon_table.py"
+PATH = Path(__file__).parents[4] / "tools" / "photon_walk.py"
 SEED = np.array([11, 12, 13], np.uint64)
 
 
 @pytest.fixture(scope="module")
 def recipe():
-    spec = importlib.util.spec_from_file_location("make_photon_table", PATH)
+    spec = importlib.util.spec_from_file_location("photon_walk", PATH)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # compiled code is loaded again by its module's name
     spec.loader.exec_module(module)
