@@ -281,11 +281,16 @@ float microstructureMode() {
 }
 
 vec4 microstructureAt(vec2 uv, out float shown) {
+  shown = 0.0;
+#if !MICROSTRUCTURE
+  return vec4(0.0);
+#else
   float whole = floor(p_microstructure_virtual_px / exp2(p_microstructure_place.z));
   vec2 at = uv * whole - p_microstructure_place.xy;
   vec2 inside = min(at, p_microstructure_side_px - at) - p_microstructure_margin_px;
   shown = smoothstep(0.0, 24.0, min(inside.x, inside.y)) * step(0.5, p_microstructure_place.w);
   return buffer_microstructure(at / p_microstructure_side_px);
+#endif
 }
 
 // Variance of slopes along one axis, relative to neutral skin's.

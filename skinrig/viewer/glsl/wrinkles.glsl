@@ -102,8 +102,9 @@ void main() {
 
 //@chunk hybrid_surface
 void adjustHybridNormals(inout SurfacePoint s) {
+#if HYBRID
   vec4 first = buffer_softened_red_green(s.uv);
   vec2 second = buffer_softened_blue(s.uv).xy;
-  if (p_hybrid_normals < 0.5) return;
   s.diffuseNormals = mat3(tilted(s, -first.xy), tilted(s, -first.zw), tilted(s, -second));
+#endif
 }

@@ -45,13 +45,17 @@ V.start.push(() => {
   }
   V.hair = {roots, kinds, count: roots.length, points: table("hair_points"),
     opening: table("hair_opening"), fiber: gl.createBuffer(), coverage: gl.createBuffer()};
+  // faces of the undercoat, with closed and with open lids; 2/255 is not drawn
+  const coverage = table("hair_coverage");
+  const isCovered = (_, i, all) => [0, 1, 2].some(k => coverage[all[i - i % 3 + k]] > 2);
+  V.hair.covered = [V.scene.mesh.faces, V.openFaces].map(faces => V.uploadFaces(faces.filter(isCovered)));
   gl.bindVertexArray(null);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.fiber);
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(fiber), gl.STATIC_DRAW);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
-  gl.bufferData(gl.ARRAY_BUFFER, table("hair_coverage"), gl.STATIC_DRAW);
+  gl.bufferData(gl.ARRAY_BUFFER, coverage, gl.STATIC_DRAW);
   V.passes.push({
-    name: "hair", after: ["surface", "shadow"], enabled: V.haired,
+    name: "hair", after: ["surface", "shadow"], enabled: V.haired, depth: "surface",
     key: p => [V.hairKey(p), V.lightsKey(p), p.ambient, V.shadowed(p)].join(),
     targets: () => ({hair: {format: "RGBA16F", size: V.screen(), space: "screen", filter: "nearest"}}),
     draw: ctx => {
@@ -156,20 +160,18 @@ V.hairBuffers = (side, p) => {
 V.drawHair = (ctx, side, p, uniforms) => {
   const gl = V.gl;
   const mesh = V.movedMesh(side, p);
-  // all heads are hidden by the depth of the whole image
-  const frame = {...uniforms, ...V.lightFrame(side, p),
-    b_irradiance: ctx.side.buffers.get("irradiance").texture};
-  V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "further_lights",
-    "environment_light", "hair_depth", "undercoat_fragment"]), side, p, {...frame, u_shown: [p.hair, p.brows]});
+  const frame = {...uniforms, ...V.lightFrame(side, p)};
+  const defines = {PI: "3.14159265358979", ...V.lightDefines(p)};
+  V.use(V.program(["mesh_attributes", "hair_place", "undercoat_vertex"], ["surface_varyings", "further_lights",
+    "environment_light", "undercoat_fragment"], defines), side, p, {...frame, u_shown: [p.hair, p.brows]});
   gl.bindVertexArray(mesh.vao);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
   gl.enableVertexAttribArray(V.ATTRIBUTES.a_coverage);
   gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 1, gl.UNSIGNED_BYTE, true, 0, 0);
-  gl.drawElements(gl.TRIANGLES, mesh.count, V.faceType, 0);
+  V.drawMesh(side, p, V.hair.covered[Number(V.lidsOpen(p))]);
   const made = V.hairBuffers(side, p);
-  V.use(V.program(["hair_light", "hair_vertex"],
-    ["further_lights", "environment_light", "hair_depth", "hair_fragment"], {PI: "3.14159265358979"}),
-    side, p, frame);
+  V.use(V.program(["hair_place", "hair_light", "hair_vertex"],
+    ["further_lights", "environment_light", "hair_fragment"], defines), side, p, frame);
   gl.bindVertexArray(made.vao);
   gl.drawElements(gl.TRIANGLES, made.indices, gl.UNSIGNED_INT, 0);
 };

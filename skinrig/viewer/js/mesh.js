@@ -7,15 +7,34 @@ V.uploadMesh = () => {
   const gl = V.gl;
   const faces = V.scene.mesh.faces;
   V.faceType = faces instanceof Uint16Array ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT;
-  V.staticBuffers = {uv: gl.createBuffer(), rest: gl.createBuffer(), faces: gl.createBuffer()};
-  gl.bindVertexArray(null);
+  V.staticBuffers = {uv: gl.createBuffer(), faces: V.uploadFaces(faces)};
   gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.uv);
   gl.bufferData(gl.ARRAY_BUFFER, V.scene.mesh.uv, gl.STATIC_DRAW);
-  gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.rest);
-  gl.bufferData(gl.ARRAY_BUFFER, V.scene.mesh.positions, gl.STATIC_DRAW);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.faces);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
   V.restAngles = V.vertexNormals(V.scene.mesh.positions);
+};
+
+// Faces by cell of the texture, so that a vertex of several faces is computed once; from the tip of the
+// nose to the back of the head, so that what is hidden is not shaded.
+V.ORDER = {CELLS: 48, SLAB_MM: 40};
+V.drawingOrder = faces => {
+  const {uv, positions} = V.scene.mesh;
+  const cells = new Map();
+  for (let f = 0; f < faces.length; f += 3) {
+    const v = faces[f];
+    const [column, row] = [uv[2 * v], uv[2 * v + 1]].map(x => Math.floor(V.ORDER.CELLS * x));
+    const key = row * V.ORDER.CELLS + column;
+    if (!cells.has(key)) cells.set(key, {slab: Math.round(positions[3 * v + 2] / V.ORDER.SLAB_MM), faces: []});
+    cells.get(key).faces.push(faces[f], faces[f + 1], faces[f + 2]);
+  }
+  return new faces.constructor([...cells.values()].sort((a, b) => b.slab - a.slab).flatMap(cell => cell.faces));
+};
+V.uploadFaces = faces => {
+  const gl = V.gl;
+  const buffer = gl.createBuffer();
+  gl.bindVertexArray(null);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, V.drawingOrder(faces), gl.STATIC_DRAW);
+  return {buffer, count: faces.length};
 };
 
 // Positions under the weights; float64 sums so that the order of shapes does not matter.
@@ -127,18 +146,17 @@ V.movedMesh = (side, p) => {
     gl.enableVertexAttribArray(V.ATTRIBUTES[names[i]]);
     gl.vertexAttribPointer(V.ATTRIBUTES[names[i]], 3, gl.FLOAT, false, 0, 0);
   });
-  for (const [name, buffer, width] of [["a_uv", "uv", 2], ["a_rest", "rest", 3]]) {
-    gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers[buffer]);
-    gl.enableVertexAttribArray(V.ATTRIBUTES[name]);
-    gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
-  }
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, open ? V.staticBuffers.openFaces : V.staticBuffers.faces);
-  side.mesh = {count: (open ? V.openFaces : V.scene.mesh.faces).length, vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.uv);
+  gl.enableVertexAttribArray(V.ATTRIBUTES.a_uv);
+  gl.vertexAttribPointer(V.ATTRIBUTES.a_uv, 2, gl.FLOAT, false, 0, 0);
+  side.mesh = {faces: open ? V.staticBuffers.openFaces : V.staticBuffers.faces, vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
   return side.mesh;
 };
 
-V.drawMesh = (side, p) => {
+V.drawMesh = (side, p, faces = null) => {
   const mesh = V.movedMesh(side, p);
+  const {buffer, count} = faces ?? mesh.faces;
   V.gl.bindVertexArray(mesh.vao);
-  V.gl.drawElements(V.gl.TRIANGLES, mesh.count, V.faceType, 0);
+  V.gl.bindBuffer(V.gl.ELEMENT_ARRAY_BUFFER, buffer);
+  V.gl.drawElements(V.gl.TRIANGLES, count, V.faceType, 0);
 };

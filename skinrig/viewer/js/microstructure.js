@@ -258,6 +258,7 @@ V.start.push(() => {
     cost: p => ({taps: 11 * n2(p), bytes: 11 * n2(p)}),
   });
   V.surface.chunks.push("microstructure_surface");
+  V.surface.defines.push(p => ({MICROSTRUCTURE: Number(drawn(p))}));
   V.surface.adjust.push("adjustMicrostructure");
   V.surface.after.push("microstructure", "strain");
   V.surface.keys.push(p => [p.microstructure, windowKey(p), V.weightsKey(p)].join());

@@ -75,12 +75,13 @@ V.start.push(() => {
       ctx.clear(0, 0, 0, 0);
       ctx.mesh(V.program(["mesh_attributes", "uv_vertex"],
         ["surface_varyings", "surface_point", "static_relief", "hybrid_source_fragment"],
-        V.surfaceDefines()));
+        V.surfaceDefines(ctx.p)));
     },
     cost: () => ({taps: 5 * side ** 2, bytes: 8 * side ** 2}),
   }, soften("softening", "hybrid_source", [1, 0], {}),
   soften("softened", "softening", [0, 1], {FROM_SOFTENING: 1}));
   V.surface.chunks.push("hybrid_surface");
+  V.surface.defines.push(p => ({HYBRID: Number(hybrid(p))}));
   V.surface.adjust.push("adjustHybridNormals");
   V.surface.after.push("softened");
   V.surface.keys.push(p => p.hybrid_normals);
