@@ -69,7 +69,7 @@ V.vertexNormals = (positions, faces = V.scene.mesh.faces) => {
     let nx = e[1] * e[5] - e[2] * e[4];
     let ny = e[2] * e[3] - e[0] * e[5];
     let nz = e[0] * e[4] - e[1] * e[3];
-    const size = Math.hypot(nx, ny, nz);
+    const size = Math.sqrt(nx * nx + ny * ny + nz * nz);
     if (!(size > 1e-12)) continue;
     nx /= size; ny /= size; nz /= size;
     for (let k = 0; k < 3; k++) {
@@ -83,7 +83,7 @@ V.vertexNormals = (positions, faces = V.scene.mesh.faces) => {
   const out = new Float32Array(positions.length);
   for (let v = 0; v < weld.length; v++) {
     const at = 3 * weld[v];
-    const size = Math.hypot(sum[at], sum[at + 1], sum[at + 2]) || 1;
+    const size = Math.sqrt(sum[at] ** 2 + sum[at + 1] ** 2 + sum[at + 2] ** 2) || 1;
     for (let c = 0; c < 3; c++) out[3 * v + c] = sum[at + c] / size;
   }
   return out;
@@ -131,10 +131,10 @@ V.movedMesh = (side, p) => {
   const positions = V.moveLids(V.morph(p.weights), p);
   const turned = V.vertexNormals(positions, open ? V.openFaces : V.scene.mesh.faces);
   const rest = open ? V.openAngles : V.restAngles;
-  const normals = Float32Array.from(V.scene.mesh.normals, (n, i) => n + turned[i] - rest[i]);
+  const normals = V.scene.mesh.normals.map((n, i) => n + turned[i] - rest[i]);
   if (open) V.lids.forEach(lid => lid.vertices.forEach(v => normals.set(turned.subarray(3 * v, 3 * v + 3), 3 * v)));
   for (let i = 0; i < normals.length; i += 3) {
-    const size = Math.hypot(normals[i], normals[i + 1], normals[i + 2]) || 1;
+    const size = Math.sqrt(normals[i] ** 2 + normals[i + 1] ** 2 + normals[i + 2] ** 2) || 1;
     for (let c = 0; c < 3; c++) normals[i + c] /= size;
   }
   const [tangent, bitangent] = V.vertexTangents(positions);

@@ -21,9 +21,7 @@ V.wrinkles.zones = p => {
 // Texels of the softened normals a millimeter of skin has, the median over the face.
 V.wrinkles.texelsPerMm = () => {
   if (V.wrinkles.perMm) return V.wrinkles.perMm;
-  const {positions, faces, uv} = V.scene.mesh;
-  const rest = Float64Array.from(positions);
-  const {metric, valid} = V.strain.vertices(rest, rest, faces, uv);
+  const {metric, valid} = V.strain.framesOf(Float64Array.from(V.scene.mesh.positions));
   const roots = [];
   valid.forEach((good, v) => {
     const [a, b, c] = metric.subarray(3 * v, 3 * v + 3);
