@@ -40,8 +40,9 @@ V.start.push(() => {
 });
 
 // Lids around the eyeballs; skin that an expression moves into the eye rests on it.
-V.moveLids = (positions, p) => {
-  if (!V.lidsOpen(p)) return positions;
+V.moveLids = (closed, p) => {
+  if (!V.lidsOpen(p)) return closed;
+  const positions = closed.slice();
   const {lid_steps_per_mm: steps, apex_mm: apex} = V.scene.facts.face_parts;
   const w = V.opening(p);
   const radius = apex + V.EYES.MARGIN_MM;

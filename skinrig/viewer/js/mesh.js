@@ -37,8 +37,10 @@ V.uploadFaces = faces => {
   return {buffer, count: faces.length};
 };
 
-// Positions under the weights; float64 sums so that the order of shapes does not matter.
+// Positions under the weights, the last ones kept; float64 sums so that the order of shapes does not matter.
 V.morph = weights => {
+  const key = V.weightsKey({weights});
+  if (V.morphed?.key === key) return V.morphed.positions;
   const rest = V.scene.mesh.positions;
   const sum = Float64Array.from(rest);
   for (const [name, weight] of Object.entries(weights)) {
@@ -46,7 +48,8 @@ V.morph = weights => {
     if (!deltas || weight === 0) continue;
     for (let i = 0; i < sum.length; i++) sum[i] += weight * deltas[i];
   }
-  return Float32Array.from(sum);
+  V.morphed = {key, positions: Float32Array.from(sum)};
+  return V.morphed.positions;
 };
 
 // Normals weighted by the angle of each face; vertices at one place share a normal.
@@ -95,20 +98,27 @@ V.vertexTangents = positions => {
   const along = [new Float32Array(positions.length), new Float32Array(positions.length)];
   const area = new Float32Array(uv.length / 2);
   for (let f = 0; f < faces.length; f += 3) {
-    const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]];
+    const a = faces[f], b = faces[f + 1], c = faces[f + 2];
     const u1 = uv[2 * b] - uv[2 * a];
     const v1 = uv[2 * b + 1] - uv[2 * a + 1];
     const u2 = uv[2 * c] - uv[2 * a];
     const v2 = uv[2 * c + 1] - uv[2 * a + 1];
     const det = u1 * v2 - u2 * v1;
     const sign = Math.sign(det);
-    for (const v of [a, b, c]) area[v] += Math.abs(det);
+    area[a] += Math.abs(det);
+    area[b] += Math.abs(det);
+    area[c] += Math.abs(det);
     for (let k = 0; k < 3; k++) {
       const p1 = positions[3 * b + k] - positions[3 * a + k];
       const p2 = positions[3 * c + k] - positions[3 * a + k];
       const du = sign * (p1 * v2 - p2 * v1);
       const dv = sign * (p2 * u1 - p1 * u2);
-      for (const v of [a, b, c]) { along[0][3 * v + k] += du; along[1][3 * v + k] += dv; }
+      along[0][3 * a + k] += du;
+      along[0][3 * b + k] += du;
+      along[0][3 * c + k] += du;
+      along[1][3 * a + k] += dv;
+      along[1][3 * b + k] += dv;
+      along[1][3 * c + k] += dv;
     }
   }
   for (let v = 0; v < area.length; v++) {

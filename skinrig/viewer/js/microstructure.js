@@ -27,12 +27,7 @@ V.microstructure.aim = p => {
   const key = V.weightsKey(p) + V.cameraKey(p) + V.screen().join();
   if (V.microstructure.aimed?.key === key) return V.microstructure.aimed.found;
   const {faces, uv} = V.scene.mesh;
-  const moving = V.weightsKey(p);
-  if (V.microstructure.moving !== moving) {
-    V.microstructure.moving = moving;
-    V.microstructure.positions = V.morph(p.weights);
-  }
-  const x = V.microstructure.positions;
+  const x = V.morph(p.weights);
   const camera = V.camera(p, V.screen());
   const d = V.direction(p.camera_yaw_deg, p.camera_pitch_deg).map(c => -c);
   const o = camera.eye;
@@ -154,18 +149,22 @@ V.microstructure.drawn = p => p.microstructure > 0.5 && p.microstructure_place[3
 V.microstructure.moves = p => V.microstructure.drawn(p) && p.microstructure > 1.5;
 
 V.start.push(() => {
-  const strained = ["strain_tensor", "strain_metric"];
   const map = (format, size, more = {}) => ({format, size: [size, size], space: "uv",
     filter: "nearest", ...more});
   V.passes.push({
     name: "strain", after: [], key: V.weightsKey,
-    targets: p => Object.fromEntries(strained.map(name =>
-      [name, map("RGBA32F", p.strain_px, {filter: "linear"})])),
+    targets: p => ({strain_tensor: map("RGBA32F", p.strain_px, {filter: "linear"})}),
     draw: ctx => V.strain.draw(ctx, V.program(["strain_vertex"], ["strain_fragment"]),
       {u_window: [0, 0, 1, 1]}),
-    cost: p => ({taps: 0, bytes: 32 * p.strain_px ** 2}),
+    cost: p => ({taps: 0, bytes: 16 * p.strain_px ** 2}),
   }, {
-    name: "strain view", after: ["strain"], demanded: true, key: () => "",
+    name: "strain metric", after: [], demanded: true, key: V.weightsKey,
+    targets: p => ({strain_metric: map("RGBA32F", p.strain_px)}),
+    draw: ctx => V.strain.draw(ctx, V.program(["strain_vertex"], ["metric_fragment"]),
+      {u_window: [0, 0, 1, 1]}),
+    cost: p => ({taps: 0, bytes: 16 * p.strain_px ** 2}),
+  }, {
+    name: "strain view", after: ["strain", "strain metric"], demanded: true, key: () => "",
     targets: p => ({strain: map("RGBA32F", p.strain_px)}),
     draw: ctx => ctx.full(V.program(["full_vertex"], ["principal", "strain_view"]),
       {u_pixels: ctx.size}),
