@@ -144,6 +144,7 @@ layout(location = 0) out vec4 o_inspect;
 layout(location = 1) out vec4 o_normal;
 in float v_depth;
 void main() {
-  o_inspect = vec4(v_uv, melaninFraction(v_uv), blendHemoglobin(v_uv));
+  vec2 neutral = neutralFractions(v_uv);
+  o_inspect = vec4(v_uv, melaninFraction(neutral), blendHemoglobin(v_uv, neutral.g));
   o_normal = vec4(normalize(v_normal), v_depth);
 }

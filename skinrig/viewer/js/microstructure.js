@@ -196,13 +196,20 @@ V.start.push(() => {
   const side = p => p.microstructure_side_px;
   const chunks = ["principal", "kernel_lookup"];
   const first = p => `${p.microstructure_sampling}`;
+  // lines of a pixel are up to 64 pixels long, and a cubic two more
+  const nearBorder = p => {
+    const [x, y, level] = p.microstructure_place;
+    const last = Math.floor(p.microstructure_virtual_px / 2 ** level) - side(p) - 66;
+    return Math.min(x, y) < 66 || Math.max(x, y) > last;
+  };
   // taps of a Gaussian along a line at the largest kernel, an upper bound
   const taps = p => n2(p) * (1 + 2 * (facts.reach_px - 2) * (p.microstructure_sampling ? 16 : 4));
   const pass = (name, source, axis) => ({
     name, after: [source, "window strain", "window pad"], enabled: moves,
     key: p => [windowKey(p), first(p)].join(),
     targets: p => ({[name]: map("R32F", side(p))}),
-    draw: ctx => ctx.full(V.program(["full_vertex"], [...chunks, "line_convolution"]),
+    draw: ctx => ctx.full(V.program(["full_vertex"], [...chunks, "line_convolution"],
+      {CUBIC: Number(ctx.p.microstructure_sampling > 0.5), MIRRORED: Number(nearBorder(ctx.p))}),
       {u_source: ctx.side.buffers.get(source).texture, u_axis: axis, ...table}),
     cost: p => ({taps: taps(p), bytes: 4 * n2(p)}),
   });
