@@ -3,7 +3,7 @@ Object.assign(V.defaults, {scattering: true, texturing: "post", scattering_scale
 
 // Powers of the albedo before and after the blur; "both" blurs a measured map twice.
 V.POWERS = {post: [0, 1], pre: [1, 0], both: [0.5, 0.5]};
-V.SCATTER = {taps: 4, reach: 2.5, slantLimit: 4, interpolation: 0.75 ** 4, leastPx: 0.25};
+V.SCATTER = {taps: 3, reach: 2.5, slantLimit: 4, interpolation: 0.75 ** 4, leastPx: 0.25};
 
 // Profiles {variances_mm2, weights: [[r, g, b], ...]} by name; other scripts may add their own and
 // a function that chooses: V.profileName = p => name.
