@@ -1,14 +1,16 @@
 //@chunk hemoglobin_rig_fragment
 // Scale and bias of the mixture, Jimenez 2010 eq. (6), with the factor of all blood in both; and
 // the stored mean that is taken off the neutral map.
-uniform float u_weights[STATES];
+uniform float u_weights[STATES];  // of states with a weight, which are u_layers
+uniform float u_layers[STATES];
+uniform int u_count;
 uniform float u_gain;
 in vec2 v_uv;
 layout(location = 0) out vec4 o_rig;
 void main() {
   vec2 mixed = vec2(0.0);
-  for (int i = 0; i < STATES; i++) {
-    mixed += u_weights[i] * sample_facial_states(vec3(v_uv, float(i))).rg;
+  for (int i = 0; i < u_count; i++) {
+    mixed += u_weights[i] * sample_facial_states(vec3(v_uv, u_layers[i])).rg;
   }
   o_rig = vec4(u_gain * mixed, sample_facial_states(vec3(v_uv, 0.0)).g, 1.0);
 }

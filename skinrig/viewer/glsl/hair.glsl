@@ -121,7 +121,7 @@ vec3 strandFrom(Strand s, float intensity, vec3 light) {
   float half_cos = sqrt(clamp(0.5 + 0.5 * cos_phi, 0.0, 1.0));
   float sum = sin_i + sin_r;
   float base = 1.0 - sqrt(clamp(0.5 + 0.5 * dot(light, s.toEye), 0.0, 1.0));
-  float fresnel = 0.046 + 0.954 * pow(base, 5.0);
+  float fresnel = 0.046 + 0.954 * base * base * base * base * base;
   vec3 inside = insideAt(cos_i);
   vec3 direct = vec3(lobe(sum + 0.12, 0.16) * 0.25 * half_cos * fresnel)
     + lobe(sum - 0.06, 0.08) * exp(-3.65 * cos_phi - 3.98) * inside * 0.9
