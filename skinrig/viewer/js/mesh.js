@@ -159,7 +159,8 @@ V.movedMesh = (side, p) => {
   gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.uv);
   gl.enableVertexAttribArray(V.ATTRIBUTES.a_uv);
   gl.vertexAttribPointer(V.ATTRIBUTES.a_uv, 2, gl.FLOAT, false, 0, 0);
-  side.mesh = {faces: open ? V.staticBuffers.openFaces : V.staticBuffers.faces, vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
+  side.mesh = {faces: open ? V.staticBuffers.openFaces : V.staticBuffers.faces, vao: mesh.vao,
+    buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
   return side.mesh;
 };
 
