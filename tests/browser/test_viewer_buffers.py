@@ -213,7 +213,7 @@ def test_screen_space_scattering_matches_model(viewer, scene, texturing, distanc
     got = viewer.read("radiance")[..., :3]
     seen = source[..., 3] > 0.0
     error = np.abs(got - wanted)[seen]
-    # up to eight passes of half floats, 2^-11 each; texture coordinates of taps in steps of 1/256 px
+    # at most eight passes of half floats, 2^-11 each; texture coordinates in steps of 1/256 px
     assert np.percentile(error, 99.0) < 6e-3
     assert np.median(error) < 1.5e-3
     # without scattering the picture differs by far more
