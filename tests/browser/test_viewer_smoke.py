@@ -27,3 +27,32 @@ def test_first_image_equals_redrawn_image(open_page, procedural_html):
     assert first[first[..., 3] > 0, 0].std() > 0.005
     viewer.bench(1)
     np.testing.assert_array_equal(viewer.read("albedo"), first)
+
+
+@pytest.mark.long
+def test_changed_page_equals_page_opened_so(open_page, procedural_html, viewer):
+    """Bit for bit, whatever was drawn before: light, camera, expression, parts, and back.
+
+    The other page has the same states in the opposite order.
+    """
+    expression = {"weights": {"anger": 0.8, "surprise": 0.3}}
+    steps = [
+        {"light_azimuth_deg": -50, "light_elevation_deg": 10, "eyes_open": 1, "brows": 1},
+        {"hair": 1, "camera_yaw_deg": 55, "camera_pitch_deg": 12},
+        {"fill": 0.3, "rim": 0.4, "environment": "window", **expression},
+        {"camera_distance_mm": 240, "camera_yaw_deg": -20},
+        {"camera_distance_mm": 700, "weights": {"anger": 0.0}, "environment": "none", "fill": 0},
+    ]
+    states = [dict(viewer.set(**step)) for step in steps]
+    fresh = open_page(procedural_html)
+    names = ("irradiance", "specular", "albedo", "radiance", "hair", "display", "strain", "lit")
+    expected = []
+    for state in reversed(states):
+        fresh.set(**state)
+        expected.append({name: fresh.read(name) for name in names})
+    for state, buffers in zip(states, reversed(expected), strict=True):
+        viewer.set(**state)
+        for name, values in buffers.items():
+            np.testing.assert_array_equal(viewer.read(name), values)
+    for i, one in enumerate(expected[1:]):
+        assert np.abs(one["display"] - expected[i]["display"]).max() > 0.1

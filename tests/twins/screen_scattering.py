@@ -54,7 +54,7 @@ class Sampling:
         Largest change of depth along the screen, mm/mm, that narrows the blur.
     """
 
-    taps: int = 4
+    taps: int = 3
     reach: float = 2.5
     slant_limit: float = 4.0
 
@@ -70,7 +70,7 @@ class Sampling:
         Examples
         --------
         >>> round(Sampling().widening, 3)
-        1.02
+        1.014
         """
         weight = np.exp(-0.5 * self.offsets**2)
         total = 1.0 + 2.0 * float(weight.sum())

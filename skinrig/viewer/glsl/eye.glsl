@@ -106,8 +106,7 @@ void main() {
   vec3 irradiance = vec3(diffuseFrom(key, u_to_light, shading, beside, below)
     + p_ambient * open * (0.6 + 0.4 * round.y));
   vec3 bright = vec3(highlightFrom(key, u_to_light, wet, eye, alpha));
-  for (int i = 0; i < 2; i++) {
-    if (u_further_intensity[i] <= 0.0) continue;
+  for (int i = 0; i < FURTHER; i++) {
     // the rim of the socket shadows the eye from light behind it
     float intensity = furtherIntensity(i, v_position - u_light_center) * smoothstep(-0.25, 0.05, u_further_to[i].z);
     irradiance += diffuseFrom(intensity, u_further_to[i], shading, beside, below);
@@ -117,11 +116,11 @@ void main() {
   float base = 1.0 - max(dot(wet, eye), 0.0);
   float reflected = 0.025 + 0.6 * pow(base, 5.0);
   bright += open * p_ambient * reflected * (1.2 + 1.2 * mirrored.y);
-  if (u_surrounded > 0.5) {
-    float a2 = alpha * alpha;
-    irradiance += open * environmentIrradiance(shading);
-    bright += open * reflected * environmentLight(mirrored, vec3(1.0, exp(-a2), exp(-4.0 * a2)));
-  }
+#if SURROUNDED
+  float a2 = alpha * alpha;
+  irradiance += open * environmentIrradiance(shading);
+  bright += open * reflected * environmentLight(mirrored, vec3(1.0, exp(-a2), exp(-4.0 * a2)));
+#endif
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(albedo, 1.0);
   o_specular = vec4(min(bright, 6.0), 0.12);

@@ -2,7 +2,7 @@
 out vec2 v_uv;
 void main() {
   v_uv = vec2(float((gl_VertexID << 1) & 2), float(gl_VertexID & 2));
-  gl_Position = vec4(2.0 * v_uv - 1.0, 0.0, 1.0);
+  gl_Position = vec4(2.0 * v_uv - 1.0, 1.0, 1.0);
 }
 //@chunk mesh_attributes
 in vec3 a_position;
@@ -10,20 +10,17 @@ in vec3 a_normal;
 in vec2 a_uv;
 in vec3 a_tangent;
 in vec3 a_bitangent;
-in vec3 a_rest;
 out vec3 v_position;
 out vec3 v_normal;
 out vec2 v_uv;
 out vec3 v_tangent;
 out vec3 v_bitangent;
-out vec3 v_rest;
 void passAttributes() {
   v_position = a_position;
   v_normal = a_normal;
   v_uv = a_uv;
   v_tangent = a_tangent;
   v_bitangent = a_bitangent;
-  v_rest = a_rest;
 }
 //@chunk mesh_vertex
 uniform mat4 u_view;
@@ -46,6 +43,5 @@ in vec3 v_normal;
 in vec2 v_uv;
 in vec3 v_tangent;   // change of the point along u, mm
 in vec3 v_bitangent; // along v
-in vec3 v_rest;      // position at rest, mm
 //@chunk uv_varying
 in vec2 v_uv;

@@ -1,42 +1,41 @@
-//@chunk hair_depth
-// Whether the surface of the skin hides a point; crowds share one depth.
-bool hiddenBySkin(float depth, float tolerance) {
-  float skin = texel_irradiance(ivec2(gl_FragCoord.xy)).a;
-  return skin > 0.0 && depth > skin + tolerance;
-}
-//@chunk undercoat_vertex
+//@chunk hair_place
+// On the image, with the depth of a point that is nearer by a tolerance: skin there does not hide it.
 uniform mat4 u_view;
 uniform mat4 u_projection;
+vec4 hairPlace(vec3 position, float tolerance_mm) {
+  vec4 seen = u_view * vec4(position, 1.0);
+  vec4 place = u_projection * seen;
+  vec4 nearer = u_projection * (seen + vec4(0.0, 0.0, tolerance_mm, 0.0));
+  return vec4(place.xy, nearer.z / nearer.w * place.w, place.w);
+}
+//@chunk undercoat_vertex
 in float a_coverage;
-out float v_depth;
 out float v_coverage;
 void main() {
   passAttributes();
-  vec4 seen = u_view * vec4(a_position, 1.0);
-  v_depth = -seen.z;
   v_coverage = a_coverage;
-  gl_Position = u_projection * seen;
+  gl_Position = hairPlace(a_position, 0.4);
 }
 //@chunk undercoat_fragment
 uniform vec3 u_to_light;
 uniform vec3 u_light_center;
 uniform vec3 u_multiple;
 uniform vec2 u_shown;
-in float v_depth;
 in float v_coverage;
 layout(location = 0) out vec4 o_hair;
 void main() {
   bool brow = v_position.z > -55.0 && v_position.y < 55.0;
   float covered = v_coverage * (brow ? u_shown.y : u_shown.x);
-  if (covered < 0.01 || hiddenBySkin(v_depth, 0.4)) discard;
+  if (covered < 0.01) discard;
   vec3 normal = normalize(v_normal);
   float direct = clamp(dot(normal, u_to_light), 0.0, 1.0);
   vec3 light = vec3(0.6 * p_light_intensity * direct + p_ambient * (0.5 + 0.3 * normal.y));
-  for (int i = 0; i < 2; i++) {
-    if (u_further_intensity[i] <= 0.0) continue;
+  for (int i = 0; i < FURTHER; i++) {
     light += 0.6 * furtherIntensity(i, v_position - u_light_center) * clamp(dot(normal, u_further_to[i]), 0.0, 1.0);
   }
-  if (u_surrounded > 0.5) light += 0.6 * environmentIrradiance(normal);
+#if SURROUNDED
+  light += 0.6 * environmentIrradiance(normal);
+#endif
   o_hair = vec4(covered * light * (u_multiple + 0.004), covered);
 }
 //@chunk hair_light
@@ -47,8 +46,7 @@ uniform vec3 u_light_up;
 uniform vec3 u_light_to;
 uniform float u_light_scale;
 float hairLit(vec3 position) {
-#ifdef HAS_shadow_depth
-  if (p_shadows < 0.5) return 1.0;
+#if SHADOWED
   vec3 from = position - u_light_center;
   float height = dot(from, u_light_to);
   vec2 at = vec2(dot(from, u_light_right), dot(from, u_light_up)) * u_light_scale + 0.5;
@@ -64,8 +62,6 @@ float hairLit(vec3 position) {
 #endif
 }
 //@chunk hair_vertex
-uniform mat4 u_view;
-uniform mat4 u_projection;
 uniform vec3 u_eye;
 uniform float u_pixels;
 in vec3 a_position;
@@ -76,7 +72,6 @@ out vec3 v_position;
 out vec3 v_tangent;
 out vec3 v_normal;
 out vec4 v_fiber;
-out float v_depth;
 out float v_lit;
 void main() {
   float width = abs(a_fiber.w);
@@ -93,9 +88,7 @@ void main() {
   v_normal = a_normal;
   v_fiber = vec4(a_fiber.xyz, lock ? -half_mm / drawn : half_mm / drawn);
   v_lit = hairLit(a_position);
-  vec4 seen = u_view * vec4(v_position, 1.0);
-  v_depth = -seen.z;
-  gl_Position = u_projection * seen;
+  gl_Position = hairPlace(v_position, 0.6);
 }
 //@chunk hair_fragment
 // Marschner et al. 2003 (doi 10.1145/882262.882345): reflection R, transmission TT and inner
@@ -110,7 +103,6 @@ in vec3 v_position;
 in vec3 v_tangent;
 in vec3 v_normal;
 in vec4 v_fiber;
-in float v_depth;
 in float v_lit;
 layout(location = 0) out vec4 o_hair;
 float lobe(float x, float width) { return exp(-0.5 * x * x / (width * width)) / (2.5066 * width); }
@@ -129,7 +121,7 @@ vec3 strandFrom(Strand s, float intensity, vec3 light) {
   float half_cos = sqrt(clamp(0.5 + 0.5 * cos_phi, 0.0, 1.0));
   float sum = sin_i + sin_r;
   float base = 1.0 - sqrt(clamp(0.5 + 0.5 * dot(light, s.toEye), 0.0, 1.0));
-  float fresnel = 0.046 + 0.954 * pow(base, 5.0);
+  float fresnel = 0.046 + 0.954 * base * base * base * base * base;
   vec3 inside = insideAt(cos_i);
   vec3 direct = vec3(lobe(sum + 0.12, 0.16) * 0.25 * half_cos * fresnel)
     + lobe(sum - 0.06, 0.08) * exp(-3.65 * cos_phi - 3.98) * inside * 0.9
@@ -147,7 +139,6 @@ vec3 strandSurrounded(Strand s) {
   return s.shade * (diffuseOf(inside) * environmentIrradiance(s.normal) + lobes * environmentIrradiance(mirrored));
 }
 void main() {
-  if (hiddenBySkin(v_depth, 0.6)) discard;
   bool lock = v_fiber.w < 0.0;
   float alpha = abs(v_fiber.w);
   float tone = 1.0;
@@ -168,10 +159,11 @@ void main() {
   vec3 inside = insideAt(sqrt(max(1.0 - sin_key * sin_key, 0.0)));
   vec3 light = strandFrom(s, p_light_intensity * v_lit, u_to_light)
     + p_ambient * depth_shade * (0.6 + 0.4 * s.normal.y) * diffuseOf(inside);
-  for (int i = 0; i < 2; i++) {
-    if (u_further_intensity[i] <= 0.0) continue;
+  for (int i = 0; i < FURTHER; i++) {
     light += strandFrom(s, furtherIntensity(i, v_position - u_light_center), u_further_to[i]);
   }
-  if (u_surrounded > 0.5) light += strandSurrounded(s);
+#if SURROUNDED
+  light += strandSurrounded(s);
+#endif
   o_hair = vec4(alpha * tone * light, alpha);
 }

@@ -166,7 +166,9 @@ void main() {
 uniform sampler2D u_source;
 uniform int u_axis;
 
+ivec2 window_last;
 float at_px(ivec2 at) {
+#if MIRRORED
   ivec2 place = ivec2(p_microstructure_place.xy);
   ivec2 whole = ivec2(floor(p_microstructure_virtual_px / exp2(p_microstructure_place.z)));
   ivec2 g = at + place;
@@ -174,8 +176,9 @@ float at_px(ivec2 at) {
   if (g.y < 0) g.y = -1 - g.y;
   if (g.x >= whole.x) g.x = 2 * whole.x - 1 - g.x;
   if (g.y >= whole.y) g.y = 2 * whole.y - 1 - g.y;
-  ivec2 last = textureSize(u_source, 0) - 1;
-  return texelFetch(u_source, clamp(g - place, ivec2(0), last), 0).r;
+  at = g - place;
+#endif
+  return texelFetch(u_source, clamp(at, ivec2(0), window_last), 0).r;
 }
 
 vec4 keys(float f) {
@@ -189,10 +192,10 @@ float between(ivec2 at, vec2 by) {
   vec2 whole = floor(by);
   vec2 f = by - whole;
   ivec2 from = at + ivec2(whole);
-  if (p_microstructure_sampling < 0.5) {
-    return mix(mix(at_px(from), at_px(from + ivec2(1, 0)), f.x),
-      mix(at_px(from + ivec2(0, 1)), at_px(from + ivec2(1, 1)), f.x), f.y);
-  }
+#if !CUBIC
+  return mix(mix(at_px(from), at_px(from + ivec2(1, 0)), f.x),
+    mix(at_px(from + ivec2(0, 1)), at_px(from + ivec2(1, 1)), f.x), f.y);
+#else
   vec4 cx = keys(f.x);
   vec4 cy = keys(f.y);
   float total = 0.0;
@@ -204,11 +207,13 @@ float between(ivec2 at, vec2 by) {
     total += cy[row] * line;
   }
   return total;
+#endif
 }
 
 layout(location = 0) out vec4 height;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
+  window_last = textureSize(u_source, 0) - 1;
   float own = texelFetch(u_source, at, 0).r;
   LineKernel kernel = kernel_at(at, u_axis);
   int radius = min(int(4.0 * kernel.sigma_px + 0.5), 64);
@@ -281,11 +286,16 @@ float microstructureMode() {
 }
 
 vec4 microstructureAt(vec2 uv, out float shown) {
+  shown = 0.0;
+#if !MICROSTRUCTURE
+  return vec4(0.0);
+#else
   float whole = floor(p_microstructure_virtual_px / exp2(p_microstructure_place.z));
   vec2 at = uv * whole - p_microstructure_place.xy;
   vec2 inside = min(at, p_microstructure_side_px - at) - p_microstructure_margin_px;
   shown = smoothstep(0.0, 24.0, min(inside.x, inside.y)) * step(0.5, p_microstructure_place.w);
   return buffer_microstructure(at / p_microstructure_side_px);
+#endif
 }
 
 // Variance of slopes along one axis, relative to neutral skin's.

@@ -56,7 +56,7 @@ void main() {
 }
 //@chunk radiance_fragment
 uniform float u_post;
-uniform vec3 u_weights[GAUSSIANS];
+uniform vec3 u_weights[LEVELS];
 layout(location = 0) out vec4 o_radiance;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);

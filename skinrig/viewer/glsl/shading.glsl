@@ -57,8 +57,8 @@ float kelemenSpecular(SurfacePoint s, vec3 n) {
 }
 //@chunk further_lights
 // Fill and rim light. The head as a ball: light from behind does not reach the front.
-uniform vec3 u_further_to[2];
-uniform float u_further_intensity[2];
+uniform vec3 u_further_to[max(FURTHER, 1)];
+uniform float u_further_intensity[max(FURTHER, 1)];
 float furtherIntensity(int i, vec3 from_center) {
   float raised = dot(normalize(from_center), u_further_to[i]);
   return u_further_intensity[i] * smoothstep(-0.3, 0.1, raised);
@@ -66,7 +66,6 @@ float furtherIntensity(int i, vec3 from_center) {
 //@chunk environment_light
 // Spherical harmonics of the environment; bands are weighted by the kernel that blurs it.
 uniform vec3 u_environment[9];
-uniform float u_surrounded;
 vec3 environmentLight(vec3 d, vec3 bands) {
   vec3 first = u_environment[1] * d.y + u_environment[2] * d.z + u_environment[3] * d.x;
   vec3 second = 1.0925484 * (u_environment[4] * d.x * d.y + u_environment[5] * d.y * d.z
@@ -125,18 +124,17 @@ void main() {
   vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
   float facing = lit * clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
   vec3 specular = PI * p_light_intensity * facing * surfaceSpecular(s);
-  for (int i = 0; i < 2; i++) {
-    if (u_further_intensity[i] <= 0.0) continue;
+  for (int i = 0; i < FURTHER; i++) {
     s.toLight = u_further_to[i];
     float intensity = furtherIntensity(i, v_position - u_light_center);
     irradiance += intensity * clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
     float across = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
     specular += PI * intensity * across * surfaceSpecular(s);
   }
-  if (u_surrounded > 0.5) {
-    for (int c = 0; c < 3; c++) irradiance[c] += environmentIrradiance(s.diffuseNormals[c])[c];
-    specular += environmentHighlight(s);
-  }
+#if SURROUNDED
+  for (int c = 0; c < 3; c++) irradiance[c] += environmentIrradiance(s.diffuseNormals[c])[c];
+  specular += environmentHighlight(s);
+#endif
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
   o_specular = vec4(s.intensity * specular, surfaceWidth(v_uv));
@@ -146,6 +144,7 @@ layout(location = 0) out vec4 o_inspect;
 layout(location = 1) out vec4 o_normal;
 in float v_depth;
 void main() {
-  o_inspect = vec4(v_uv, melaninFraction(v_uv), blendHemoglobin(v_uv));
+  vec2 neutral = neutralFractions(v_uv);
+  o_inspect = vec4(v_uv, melaninFraction(neutral), blendHemoglobin(v_uv, neutral.g));
   o_normal = vec4(normalize(v_normal), v_depth);
 }

@@ -29,8 +29,7 @@ uniform float u_light_scale;
 const float STEEPEST = 4.0;   // slope of that plane, at most
 const float BIAS_MM = 0.25;   // what a surface bends within a filter, and triangles stand off it
 float litShare(vec3 position, vec3 normal) {
-#ifdef HAS_shadow_depth
-  if (p_shadows < 0.5) return 1.0;
+#if SHADOWED
   float across = dot(normal, u_light_to);
   if (across <= 0.0) return 0.0;
   vec3 from = position - u_light_center;

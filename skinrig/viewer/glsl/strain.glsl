@@ -22,6 +22,12 @@ void main() {
   out_metric = vec4(metric, 1.0);
 }
 
+//@chunk metric_fragment
+in vec3 tensor;
+in vec3 metric;
+layout(location = 0) out vec4 out_metric;
+void main() { out_metric = vec4(metric, 1.0); }
+
 //@chunk strain_cover
 in vec3 tensor;
 in vec3 metric;

@@ -37,10 +37,13 @@ void main() {
 }
 
 //@chunk wrinkle_surface
-vec2 wrinkleSlope(vec2 uv) { return -p_detail_wrinkles * buffer_wrinkle_derivatives(uv).xy; }
+vec4 moments;  // of this pixel, which surface_fragment asks for first
+vec2 wrinkleSlope(vec2 uv) {
+  moments = buffer_wrinkle_derivatives(uv);
+  return -p_detail_wrinkles * moments.xy;
+}
 
 void adjustWrinkles(inout SurfacePoint s) {
-  vec4 moments = buffer_wrinkle_derivatives(s.uv);
   // left out: all of the slopes' squares are variance that no pixel shows
   vec2 shown = p_detail_wrinkles * moments.xy;
   vec2 variance = max(moments.zw - shown * shown, 0.0);
@@ -102,8 +105,9 @@ void main() {
 
 //@chunk hybrid_surface
 void adjustHybridNormals(inout SurfacePoint s) {
+#if HYBRID
   vec4 first = buffer_softened_red_green(s.uv);
   vec2 second = buffer_softened_blue(s.uv).xy;
-  if (p_hybrid_normals < 0.5) return;
   s.diffuseNormals = mat3(tilted(s, -first.xy), tilted(s, -first.zw), tilted(s, -second));
+#endif
 }

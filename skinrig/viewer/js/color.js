@@ -8,6 +8,7 @@ V.stateWeights = p => {
   weights[0] = 1 - weights.slice(1).reduce((a, b) => a + b, 0);
   return weights;
 };
+V.weighted = weights => [...weights.keys()].filter(i => weights[i] !== 0);
 V.stateGain = p => {
   const gains = V.scene.facts.facial_color.gains;
   return 1 + Object.entries(gains).reduce((sum, [n, g]) => sum + (p.weights[n] ?? 0) * (g - 1), 0);
@@ -26,9 +27,15 @@ V.start.push(() => {
       name: "hemoglobin_rig", after: [],
       key: p => [p.person, ...V.stateWeights(p), V.stateGain(p)].join(),
       targets: () => ({hemoglobin_rig: {format: "RGBA32F", size: [width, height], space: "uv"}}),
-      draw: ctx => ctx.full(V.program(["full_vertex"], ["hemoglobin_rig_fragment"],
-        {STATES: layers}), {u_weights: V.stateWeights(ctx.p), u_gain: V.stateGain(ctx.p)}),
-      cost: () => ({taps: (layers + 1) * width * height, bytes: 16 * width * height}),
+      draw: ctx => {
+        const weights = V.stateWeights(ctx.p);
+        const drawn = V.weighted(weights);
+        const filled = values => [...values, ...Array(layers - values.length).fill(0)];
+        ctx.full(V.program(["full_vertex"], ["hemoglobin_rig_fragment"], {STATES: layers}), {
+          u_weights: filled(drawn.map(i => weights[i])), u_layers: filled(drawn), u_count: drawn.length,
+          u_gain: V.stateGain(ctx.p)});
+      },
+      cost: p => ({taps: (V.weighted(V.stateWeights(p)).length + 1) * width * height, bytes: 16 * width * height}),
     });
   }
   const {width, height} = V.scene.textures.chromophores;

@@ -8,7 +8,7 @@
 // omitting them, in radiance where 1 is a white surface. V.detail.state has this error; if it is below
 // the tolerance, they are omitted.
 Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
-V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}, found: new Map()};
+V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}, found: new Map(), near: new Map()};
 V.statistics.detail = V.detail.state;
 
 // The same for all lights. Fill and rim light reach part of the face: their derivatives are RMS over the
@@ -89,7 +89,7 @@ V.detail.between = (list, level) => {
 // Size of a canvas pixel at the nearest point of the heads, mm.
 V.detail.footprint = p => {
   const key = [V.meshKey(p), V.screen()].join();
-  if (V.detail.near?.key === key) return V.detail.near.mm;
+  if (V.detail.near.has(key)) return V.detail.near.get(key);
   const positions = V.morph(p.weights);
   let depth = Infinity;
   let scale = 1;
@@ -102,8 +102,9 @@ V.detail.footprint = p => {
       if (d > 1 && d < depth) depth = d;
     }
   }
-  V.detail.near = {key, mm: depth / scale};
-  return V.detail.near.mm;
+  if (V.detail.near.size > 8) V.detail.near.clear();
+  V.detail.near.set(key, depth / scale);
+  return depth / scale;
 };
 
 // RMS change of radiance by omitting the microstructure, by pixel size. Its slopes are isotropic: the

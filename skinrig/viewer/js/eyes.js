@@ -22,7 +22,6 @@ V.moveKey = p => `${V.weightsKey(p)}|${V.lidsOpen(p) ? p.eyes_open : 0}`;
 V.start.push(() => {
   const parts = V.scene.facts.face_parts;
   if (!parts) return;
-  const gl = V.gl;
   const {faces, positions} = V.scene.mesh;
   const table = name => V.scene.tables[name].data;
   const omitted = new Set();
@@ -34,18 +33,16 @@ V.start.push(() => {
   const kept = faces.filter((_, i) => !omitted.has(Math.floor(i / 3)));
   const edges = parts.eyes.flatMap(eye => [...table(`lid_edges_${eye.name}`)]);
   V.openFaces = new faces.constructor([...kept, ...edges]);
-  V.staticBuffers.openFaces = gl.createBuffer();
-  gl.bindVertexArray(null);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.openFaces);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, V.openFaces, gl.STATIC_DRAW);
+  V.staticBuffers.openFaces = V.uploadFaces(V.openFaces);
   V.openAngles = V.vertexNormals(positions, V.openFaces);
   V.surface.parts.push(V.drawEyes);
   V.surface.keys.push(p => [p.eyes_open, p.eyes_follow].join());
 });
 
 // Lids around the eyeballs; skin that an expression moves into the eye rests on it.
-V.moveLids = (positions, p) => {
-  if (!V.lidsOpen(p)) return positions;
+V.moveLids = (closed, p) => {
+  if (!V.lidsOpen(p)) return closed;
+  const positions = closed.slice();
   const {lid_steps_per_mm: steps, apex_mm: apex} = V.scene.facts.face_parts;
   const w = V.opening(p);
   const radius = apex + V.EYES.MARGIN_MM;
@@ -153,7 +150,7 @@ V.drawEyes = (ctx, side, p, frame, fragment = "eye_fragment") => {
   const plain = fragment !== "eye_fragment";
   const program = V.program(["mesh_attributes", "mesh_vertex"],
     ["surface_varyings", ...(plain ? [] : ["further_lights", "environment_light", "shadow_lookup", "eye_noise"]),
-      fragment], plain ? {} : V.eyeDefines());
+      fragment], plain ? {} : {...V.eyeDefines(), ...V.lightDefines(p)});
   V.eyeBuffers(side, p).list.forEach((one, i) => {
     const {center} = V.lids[i];
     V.use(program, side, p, {...frame, u_ball: center, u_gaze: V.gaze(p, center, frame.u_eye),

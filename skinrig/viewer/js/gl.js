@@ -74,7 +74,7 @@ V.program = (vertex, fragment, defines = {}) => {
   return built;
 };
 
-V.ATTRIBUTES = {a_position: 0, a_normal: 1, a_uv: 2, a_tangent: 3, a_bitangent: 4, a_rest: 5};
+V.ATTRIBUTES = {a_position: 0, a_normal: 1, a_uv: 2, a_tangent: 3, a_bitangent: 4};
 
 V.knownNames = () => [
   ...Object.keys(V.scene.textures), ...Object.keys(V.scene.tables),
@@ -243,11 +243,12 @@ V.target = (side, pass, shapes) => {
   const gl = V.gl;
   const signature = JSON.stringify(shapes);
   const old = side.targets.get(pass.name);
-  if (old && old.signature === signature) return old;
+  const owner = side.targets.get(pass.depth) ?? null;
+  if (old && old.signature === signature && old.owner === owner) return old;
   V.freeTarget(side, pass);
   const names = Object.keys(shapes);
   const size = names.length ? shapes[names[0]].size : [V.canvas.width, V.canvas.height];
-  const target = {pass, signature, size, names, shapes, textures: [], depth: null, frame: null};
+  const target = {pass, signature, size, names, shapes, textures: [], depth: null, owner, frame: null};
   if (names.length) {
     target.frame = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
@@ -258,12 +259,12 @@ V.target = (side, pass, shapes) => {
       target.textures.push(texture);
       side.buffers.set(name, {texture, target, index: i, ...shape});
     });
-    if (pass.depth) {
+    if (pass.depth === true) {
       target.depth = gl.createRenderbuffer();
       gl.bindRenderbuffer(gl.RENDERBUFFER, target.depth);
       gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, size[0], size[1]);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, target.depth);
     }
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, (owner ?? target).depth);
     gl.drawBuffers(names.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
       throw new Error(`pass ${pass.name}: its buffers cannot be drawn into on this device`);
@@ -290,7 +291,9 @@ V.bindTarget = target => {
   gl.viewport(0, 0, target.size[0], target.size[1]);
   gl.disable(gl.BLEND);
   gl.disable(gl.CULL_FACE);
-  if (target.depth) gl.enable(gl.DEPTH_TEST);
+  gl.depthMask(Boolean(target.depth));
+  gl.depthFunc(gl.LESS);
+  if (target.depth || target.owner) gl.enable(gl.DEPTH_TEST);
   else gl.disable(gl.DEPTH_TEST);
 };
 
@@ -319,6 +322,7 @@ V.context = (side, p, target) => ({
   full: (program, uniforms = {}) => {
     V.use(program, side, p, uniforms);
     V.gl.bindVertexArray(V.vao);
+    V.gl.depthFunc(V.gl.GREATER);
     V.gl.drawArrays(V.gl.TRIANGLES, 0, 3);
   },
 });

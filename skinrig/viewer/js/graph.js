@@ -15,7 +15,8 @@
 //   name, after: [names of passes],
 //   key: p => string        what it depends on besides the passes before it and the scene,
 //   targets: p => ({buffer: {format, size: [w, h], space: "uv" | "screen", filter, mip}}),
-//   depth: bool             whether it needs a depth buffer,
+//   depth: bool | name      true: it has a depth buffer; name of a pass before it: its depths hide
+//                           what is behind, and ctx.full draws where that pass drew alone,
 //   enabled: p => bool      false: it is left out, and its buffers read as zero,
 //   demanded: bool          true: drawn only where its buffer is read or viewed,
 //   draw: ctx => {},        ctx = {p, side, size: [w, h], mesh(program, uniforms),

@@ -8,6 +8,7 @@ Object.assign(V.defaults, {brows: 0, hair: 0});
 V.ATTRIBUTES.a_fiber = 8;
 V.ATTRIBUTES.a_coverage = 9;
 V.HAIR_POINTS = 5;
+V.SEGMENT = [0, 1, 2, 3, 2, 1];
 
 V.haired = p => Boolean(V.hair) && (p.brows > 0.5 || p.hair > 0.5);
 V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crowd, p.gallery, p.person].join();
@@ -45,13 +46,17 @@ V.start.push(() => {
   }
   V.hair = {roots, kinds, count: roots.length, points: table("hair_points"),
     opening: table("hair_opening"), fiber: gl.createBuffer(), coverage: gl.createBuffer()};
+  // faces of the undercoat, with closed and with open lids; 2/255 is not drawn
+  const coverage = table("hair_coverage");
+  const isCovered = (_, i, all) => [0, 1, 2].some(k => coverage[all[i - i % 3 + k]] > 2);
+  V.hair.covered = [V.scene.mesh.faces, V.openFaces].map(faces => V.uploadFaces(faces.filter(isCovered)));
   gl.bindVertexArray(null);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.fiber);
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(fiber), gl.STATIC_DRAW);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
-  gl.bufferData(gl.ARRAY_BUFFER, table("hair_coverage"), gl.STATIC_DRAW);
+  gl.bufferData(gl.ARRAY_BUFFER, coverage, gl.STATIC_DRAW);
   V.passes.push({
-    name: "hair", after: ["surface", "shadow"], enabled: V.haired,
+    name: "hair", after: ["surface", "shadow"], enabled: V.haired, depth: "surface",
     key: p => [V.hairKey(p), V.lightsKey(p), p.ambient, V.shadowed(p)].join(),
     targets: () => ({hair: {format: "RGBA16F", size: V.screen(), space: "screen", filter: "nearest"}}),
     draw: ctx => {
@@ -82,9 +87,9 @@ V.hairCurves = (mesh, p) => {
   const w = V.lidsOpen(p) ? V.opening(p) : 0;
   const at = new Float32Array(3 * n * count);
   for (let s = 0; s < count; s++) {
-    const lash = kinds[s] === "lash";
+    const opened = kinds[s] === "lash" ? w : 0;
     for (let k = 0; k < 3 * n; k++) {
-      const more = lash ? w * opening[3 * n * (s - first) + k] : 0;
+      const more = opened && opened * opening[3 * n * (s - first) + k];
       at[3 * n * s + k] = mesh.positions[3 * roots[s] + k % 3] + (points[3 * n * s + k] + more) / steps;
     }
   }
@@ -103,17 +108,15 @@ V.hairBuffers = (side, p) => {
   if (made.moved !== mesh.key) {
     const at = V.hairCurves(mesh, p);
     const [position, tangent, normal] = [0, 1, 2].map(() => new Float32Array(6 * n * count));
-    for (let s = 0; s < count; s++) {
-      for (let k = 0; k < n; k++) {
-        const here = 3 * (n * s + k);
-        const [before, after] = [k ? here - 3 : here, k < n - 1 ? here + 3 : here];
-        for (let c = 0; c < 3; c++) {
-          for (const one of [0, 3]) {
-            position[2 * here + one + c] = at[here + c];
-            tangent[2 * here + one + c] = at[after + c] - at[before + c];
-            normal[2 * here + one + c] = mesh.normals[3 * roots[s] + c];
-          }
-        }
+    for (let here = 0; here < at.length; here += 3) {
+      const k = here / 3 % n;
+      const root = 3 * roots[Math.floor(here / 3 / n)];
+      const before = k ? here - 3 : here;
+      const after = k < n - 1 ? here + 3 : here;
+      for (let c = 0; c < 6; c++) {
+        position[2 * here + c] = at[here + c % 3];
+        tangent[2 * here + c] = at[after + c % 3] - at[before + c % 3];
+        normal[2 * here + c] = mesh.normals[root + c % 3];
       }
     }
     [position, tangent, normal].forEach((data, i) => {
@@ -133,19 +136,17 @@ V.hairBuffers = (side, p) => {
   if (made.order !== order) {
     const back = V.direction(p.camera_yaw_deg, p.camera_pitch_deg);
     const middle = 3 * (n >> 1);
-    const depth = s => back.reduce((sum, b, c) => sum + b * made.at[3 * n * s + middle + c], 0);
-    const drawn = Array.from({length: count}, (_, s) => s)
-      .filter(s => (kinds[s] === "scalp" ? p.hair : p.brows) > 0.5)
-      .map(s => [depth(s), s]).sort((a, b) => a[0] - b[0]);
+    const depth = Float64Array.from(kinds, (_, s) =>
+      back.reduce((sum, b, c) => sum + b * made.at[3 * n * s + middle + c], 0));
+    const drawn = Uint32Array.from(kinds.keys())
+      .filter(s => (kinds[s] === "scalp" ? p.hair : p.brows) > 0.5).sort((a, b) => depth[a] - depth[b]);
+    // both triangles of a segment name its four corners first, which are then computed at once
     const index = new Uint32Array(6 * (n - 1) * drawn.length);
-    let to = 0;
-    for (const [, s] of drawn) {
-      for (let k = 0; k < n - 1; k++) {
-        const a = 2 * (n * s + k);
-        index.set([a, a + 1, a + 2, a + 1, a + 3, a + 2], to);
-        to += 6;
+    drawn.forEach((s, i) => {
+      for (let k = 0; k < 6 * (n - 1); k++) {
+        index[6 * (n - 1) * i + k] = 2 * n * s + 2 * Math.floor(k / 6) + V.SEGMENT[k % 6];
       }
-    }
+    });
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.buffers[3]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.DYNAMIC_DRAW);
     [made.order, made.indices] = [order, index.length];
@@ -156,20 +157,18 @@ V.hairBuffers = (side, p) => {
 V.drawHair = (ctx, side, p, uniforms) => {
   const gl = V.gl;
   const mesh = V.movedMesh(side, p);
-  // all heads are hidden by the depth of the whole image
-  const frame = {...uniforms, ...V.lightFrame(side, p),
-    b_irradiance: ctx.side.buffers.get("irradiance").texture};
-  V.use(V.program(["mesh_attributes", "undercoat_vertex"], ["surface_varyings", "further_lights",
-    "environment_light", "hair_depth", "undercoat_fragment"]), side, p, {...frame, u_shown: [p.hair, p.brows]});
+  const frame = {...uniforms, ...V.lightFrame(side, p)};
+  const defines = {PI: "3.14159265358979", ...V.lightDefines(p)};
+  V.use(V.program(["mesh_attributes", "hair_place", "undercoat_vertex"], ["surface_varyings", "further_lights",
+    "environment_light", "undercoat_fragment"], defines), side, p, {...frame, u_shown: [p.hair, p.brows]});
   gl.bindVertexArray(mesh.vao);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
   gl.enableVertexAttribArray(V.ATTRIBUTES.a_coverage);
   gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 1, gl.UNSIGNED_BYTE, true, 0, 0);
-  gl.drawElements(gl.TRIANGLES, mesh.count, V.faceType, 0);
+  V.drawMesh(side, p, V.hair.covered[Number(V.lidsOpen(p))]);
   const made = V.hairBuffers(side, p);
-  V.use(V.program(["hair_light", "hair_vertex"],
-    ["further_lights", "environment_light", "hair_depth", "hair_fragment"], {PI: "3.14159265358979"}),
-    side, p, frame);
+  V.use(V.program(["hair_place", "hair_light", "hair_vertex"],
+    ["further_lights", "environment_light", "hair_fragment"], defines), side, p, frame);
   gl.bindVertexArray(made.vao);
   gl.drawElements(gl.TRIANGLES, made.indices, gl.UNSIGNED_INT, 0);
 };

@@ -67,14 +67,18 @@ V.environmentHarmonics = p => {
 V.lightsKey = p => [p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.fill, p.rim, p.environment,
   p.environment_intensity, p.environment_azimuth_deg].join();
 
+// Programs are built for the lights that shine: a software renderer computes both sides of each branch.
+V.shiningLights = p => V.furtherLights(p).filter(one => one.intensity > 0);
+V.lightDefines = p => ({FURTHER: V.shiningLights(p).length, SURROUNDED: Number(V.surrounded(p)),
+  SHADOWED: Number(V.shadowed(p))});
 V.lightUniforms = p => {
-  const further = V.furtherLights(p);
+  const shining = V.shiningLights(p);
+  const further = shining.length ? shining : V.furtherLights(p).slice(0, 1);
   return {
     u_to_light: V.direction(p.light_azimuth_deg, p.light_elevation_deg),
     u_further_to: further.flatMap(one => one.to),
     u_further_intensity: further.map(one => one.intensity),
     u_environment: V.environmentHarmonics(p),
-    u_surrounded: Number(V.surrounded(p)),
   };
 };
 

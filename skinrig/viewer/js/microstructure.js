@@ -27,12 +27,7 @@ V.microstructure.aim = p => {
   const key = V.weightsKey(p) + V.cameraKey(p) + V.screen().join();
   if (V.microstructure.aimed?.key === key) return V.microstructure.aimed.found;
   const {faces, uv} = V.scene.mesh;
-  const moving = V.weightsKey(p);
-  if (V.microstructure.moving !== moving) {
-    V.microstructure.moving = moving;
-    V.microstructure.positions = V.morph(p.weights);
-  }
-  const x = V.microstructure.positions;
+  const x = V.morph(p.weights);
   const camera = V.camera(p, V.screen());
   const d = V.direction(p.camera_yaw_deg, p.camera_pitch_deg).map(c => -c);
   const o = camera.eye;
@@ -154,18 +149,22 @@ V.microstructure.drawn = p => p.microstructure > 0.5 && p.microstructure_place[3
 V.microstructure.moves = p => V.microstructure.drawn(p) && p.microstructure > 1.5;
 
 V.start.push(() => {
-  const strained = ["strain_tensor", "strain_metric"];
   const map = (format, size, more = {}) => ({format, size: [size, size], space: "uv",
     filter: "nearest", ...more});
   V.passes.push({
     name: "strain", after: [], key: V.weightsKey,
-    targets: p => Object.fromEntries(strained.map(name =>
-      [name, map("RGBA32F", p.strain_px, {filter: "linear"})])),
+    targets: p => ({strain_tensor: map("RGBA32F", p.strain_px, {filter: "linear"})}),
     draw: ctx => V.strain.draw(ctx, V.program(["strain_vertex"], ["strain_fragment"]),
       {u_window: [0, 0, 1, 1]}),
-    cost: p => ({taps: 0, bytes: 32 * p.strain_px ** 2}),
+    cost: p => ({taps: 0, bytes: 16 * p.strain_px ** 2}),
   }, {
-    name: "strain view", after: ["strain"], demanded: true, key: () => "",
+    name: "strain metric", after: [], demanded: true, key: V.weightsKey,
+    targets: p => ({strain_metric: map("RGBA32F", p.strain_px)}),
+    draw: ctx => V.strain.draw(ctx, V.program(["strain_vertex"], ["metric_fragment"]),
+      {u_window: [0, 0, 1, 1]}),
+    cost: p => ({taps: 0, bytes: 16 * p.strain_px ** 2}),
+  }, {
+    name: "strain view", after: ["strain", "strain metric"], demanded: true, key: () => "",
     targets: p => ({strain: map("RGBA32F", p.strain_px)}),
     draw: ctx => ctx.full(V.program(["full_vertex"], ["principal", "strain_view"]),
       {u_pixels: ctx.size}),
@@ -197,13 +196,20 @@ V.start.push(() => {
   const side = p => p.microstructure_side_px;
   const chunks = ["principal", "kernel_lookup"];
   const first = p => `${p.microstructure_sampling}`;
+  // lines of a pixel are up to 64 pixels long, and a cubic two more
+  const nearBorder = p => {
+    const [x, y, level] = p.microstructure_place;
+    const last = Math.floor(p.microstructure_virtual_px / 2 ** level) - side(p) - 66;
+    return Math.min(x, y) < 66 || Math.max(x, y) > last;
+  };
   // taps of a Gaussian along a line at the largest kernel, an upper bound
   const taps = p => n2(p) * (1 + 2 * (facts.reach_px - 2) * (p.microstructure_sampling ? 16 : 4));
   const pass = (name, source, axis) => ({
     name, after: [source, "window strain", "window pad"], enabled: moves,
     key: p => [windowKey(p), first(p)].join(),
     targets: p => ({[name]: map("R32F", side(p))}),
-    draw: ctx => ctx.full(V.program(["full_vertex"], [...chunks, "line_convolution"]),
+    draw: ctx => ctx.full(V.program(["full_vertex"], [...chunks, "line_convolution"],
+      {CUBIC: Number(ctx.p.microstructure_sampling > 0.5), MIRRORED: Number(nearBorder(ctx.p))}),
       {u_source: ctx.side.buffers.get(source).texture, u_axis: axis, ...table}),
     cost: p => ({taps: taps(p), bytes: 4 * n2(p)}),
   });
@@ -258,6 +264,7 @@ V.start.push(() => {
     cost: p => ({taps: 11 * n2(p), bytes: 11 * n2(p)}),
   });
   V.surface.chunks.push("microstructure_surface");
+  V.surface.defines.push(p => ({MICROSTRUCTURE: Number(drawn(p))}));
   V.surface.adjust.push("adjustMicrostructure");
   V.surface.after.push("microstructure", "strain");
   V.surface.keys.push(p => [p.microstructure, windowKey(p), V.weightsKey(p)].join());

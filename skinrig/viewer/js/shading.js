@@ -5,7 +5,7 @@ Object.assign(V.defaults, {
 
 // Hooks by which other scripts extend the surface:
 //   chunks     GLSL pieces that hold the functions named below
-//   defines    preprocessor values
+//   defines    functions of p: preprocessor values
 //   slopes     names of `vec2 f(vec2 uv)`: slopes of relief, summed
 //   adjust     names of `void f(inout SurfacePoint s)`, called in order
 //   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
@@ -13,12 +13,13 @@ Object.assign(V.defaults, {
 //   parts      functions that draw what is not skin, see V.drawHeads
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
-  chunks: ["static_relief"], defines: {}, slopes: [], adjust: [],
+  chunks: ["static_relief"], defines: [], slopes: [], adjust: [],
   specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig", "albedo_traits"], keys: [], parts: [],
 };
 
-V.surfaceDefines = () => ({PI: "3.14159265358979", LEAST_TABLE_M: V.LEAST_TABLE_M.toFixed(4),
-  MOST_TABLE_M: V.MOST_TABLE_M.toFixed(4), ...V.colorDefines(), ...V.surface.defines});
+V.surfaceDefines = p => ({PI: "3.14159265358979", LEAST_TABLE_M: V.LEAST_TABLE_M.toFixed(4),
+  MOST_TABLE_M: V.MOST_TABLE_M.toFixed(4), ...V.colorDefines(), ...V.lightDefines(p),
+  ...Object.assign({}, ...V.surface.defines.map(f => f(p)))});
 
 // Functions that combine the hooks.
 V.surfaceJoin = p => {
@@ -83,7 +84,7 @@ V.start.push(() => {
       const program = V.program(["mesh_attributes", "mesh_vertex"], ["surface_varyings",
         "surface_point", "skin_color", "kelemen_specular", "further_lights", "environment_light",
         "environment_highlight", "shadow_lookup", ...V.surface.chunks,
-        V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
+        V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines(ctx.p));
       V.drawHeads(ctx, program, V.lightUniforms(ctx.p), V.surface.parts);
     },
     cost: p => ({taps: (8 + 25 * V.shadowed(p)) * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),

@@ -56,7 +56,7 @@ V.start.push(() => {
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
       V.drawHeads(ctx, V.program(["mesh_attributes", "mesh_vertex"],
-        ["surface_varyings", "shadow_lookup", "lit_fragment"]));
+        ["surface_varyings", "shadow_lookup", "lit_fragment"], V.lightDefines(ctx.p)));
     },
     cost: p => ({taps: 25 * V.shadowed(p) * V.screen()[0] * V.screen()[1], bytes: 4 * V.screen()[0] * V.screen()[1]}),
   });

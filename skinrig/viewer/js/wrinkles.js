@@ -21,9 +21,7 @@ V.wrinkles.zones = p => {
 // Texels of the softened normals a millimeter of skin has, the median over the face.
 V.wrinkles.texelsPerMm = () => {
   if (V.wrinkles.perMm) return V.wrinkles.perMm;
-  const {positions, faces, uv} = V.scene.mesh;
-  const rest = Float64Array.from(positions);
-  const {metric, valid} = V.strain.vertices(rest, rest, faces, uv);
+  const {metric, valid} = V.strain.framesOf(Float64Array.from(V.scene.mesh.positions));
   const roots = [];
   valid.forEach((good, v) => {
     const [a, b, c] = metric.subarray(3 * v, 3 * v + 3);
@@ -75,12 +73,13 @@ V.start.push(() => {
       ctx.clear(0, 0, 0, 0);
       ctx.mesh(V.program(["mesh_attributes", "uv_vertex"],
         ["surface_varyings", "surface_point", "static_relief", "hybrid_source_fragment"],
-        V.surfaceDefines()));
+        V.surfaceDefines(ctx.p)));
     },
     cost: () => ({taps: 5 * side ** 2, bytes: 8 * side ** 2}),
   }, soften("softening", "hybrid_source", [1, 0], {}),
   soften("softened", "softening", [0, 1], {FROM_SOFTENING: 1}));
   V.surface.chunks.push("hybrid_surface");
+  V.surface.defines.push(p => ({HYBRID: Number(hybrid(p))}));
   V.surface.adjust.push("adjustHybridNormals");
   V.surface.after.push("softened");
   V.surface.keys.push(p => p.hybrid_normals);
