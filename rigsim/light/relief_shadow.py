@@ -323,7 +323,8 @@ def hidden_sky_fraction(
     In a direction with the normal's part n_t along it and n_z up, between the point's own tangent
     plane at elevation a and the horizon at b, ``int (n_t cos e + n_z sin e) cos e de`` is
     ``n_t (e / 2 + sin 2e / 4) + n_z sin^2 e / 2`` from a to b; with boundaries it is summed at
-    `rigsim.light.hidden_sky_kernels.ELEVATION_NODES` elevations. Level skin around the field hides the sky below the horizontal.
+    `ELEVATION_NODES` of `rigsim.light.hidden_sky_kernels`. Level skin around the field hides the
+    sky below the horizontal.
 
     Examples
     --------
