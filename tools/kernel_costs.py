@@ -158,6 +158,17 @@ def visible_fractions(uv, position, lights, radii, du, dv, horizon, highest, out
     return Cost(size, float64=flops, division=roots, exp=3 * near, gather=3 * points + 2 * near)
 
 
+def average_hits(self, rows):  # type: ignore[no-untyped-def]
+    """Rows read, pixels written; an addition per number."""
+    out = 4 * self.shape[0] * self.shape[1] * rows.shape[1]
+    return Cost(rows.nbytes + self.first.nbytes + out, float32=rows.size)
+
+
+def join_layers(parts):  # type: ignore[no-untyped-def]
+    """Each number read and written."""
+    return Cost(2 * sum_bytes(*parts.values()))
+
+
 def flow(field, own, before, after):  # type: ignore[no-untyped-def]
     """Two passes over the field; 5 operations per texel and channel."""
     return Cost(4 * field.nbytes + sum_bytes(own, before, after), float32=5 * field.size)
@@ -423,6 +434,38 @@ KERNELS = (
         "hit",
         lambda self, scene, hits, *_: hits.count,
         reason="shadow rays; their rate is not a limit of the machine",
+    ),
+    Kernel(
+        FLASH,
+        "rigsim.scenes.flash.surfaces",
+        "MitsubaSurface.trace",
+        "pixel",
+        lambda self, view, subpixels, rows: (rows[1] - rows[0]) * view.width_px,
+        reason="camera rays; their rate is not a limit of the machine",
+    ),
+    Kernel(
+        FLASH,
+        "rigsim.scenes.flash.surfaces",
+        "MitsubaSurface.skin_stokes",
+        "hit",
+        lambda self, hits, *_: hits.count,
+        reason="one fused kernel of Dr.Jit, whose operations are not listed",
+    ),
+    Kernel(
+        FLASH,
+        "rigsim.scenes.flash.surfaces",
+        "CameraHits.average",
+        "hit",
+        lambda self, rows: len(rows),
+        average_hits,
+    ),
+    Kernel(
+        FLASH,
+        "rigsim.scenes.flash.image",
+        "_joined",
+        "hit",
+        lambda parts: len(next(iter(parts.values()))),
+        join_layers,
     ),
     Kernel(
         (("dome", "capture"),),

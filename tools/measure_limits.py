@@ -191,10 +191,15 @@ def recorded(kernels: Sequence[Kernel]) -> Iterator[list[Recorder]]:
 
 def run_command(words: Sequence[str]) -> float:
     """Run a command of skinrig in this process; return its processor seconds."""
+    import drjit
     import typer
 
+    from rigsim.mitsuba.startup import load_mitsuba
+    from rigsim.mitsuba.variant import choose_variant
     from skinrig.cli import app
 
+    load_mitsuba(choose_variant("mono"))
+    drjit.set_thread_count(0)  # works in the calling thread, whose clock counts it
     begun = time.process_time()
     typer.main.get_command(app).main(args=list(words), prog_name="skinrig", standalone_mode=False)
     return time.process_time() - begun
