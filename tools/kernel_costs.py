@@ -58,6 +58,11 @@ class Kernel:
     prepare: Callable[..., tuple[Any, ...]] = lambda *args: args
     """Arguments that make the number of passes a known one."""
 
+    @property
+    def label(self) -> str:
+        """Module, with its folder, and function."""
+        return ".".join([*self.module.split(".")[-2:], self.name])
+
 
 def sum_bytes(*arrays: Any) -> float:
     """Return the bytes of arrays, and of those in tuples; other arguments have none.
@@ -270,10 +275,10 @@ def fit_basis(table, materials, kinship, value, variance, light, view, normal, v
 
 
 def mix_basis(table, weights, light, view, normals, out):  # type: ignore[no-untyped-def]
-    """Per sample: 40 operations, 9 divisions and roots, 3 arcs; 9 per basis BRDF."""
+    """Per sample: 80 operations and 9 divisions and roots for its nodes; 9 per basis BRDF."""
     samples = np.count_nonzero(out)
-    flops = (40 + 9 * weights.shape[1]) * samples
-    return Cost(sum_bytes(light, view, out), float64=flops, division=9 * samples, exp=3 * samples)
+    flops = (80 + 9 * weights.shape[1]) * samples
+    return Cost(sum_bytes(light, view, out), float64=flops, division=9 * samples)
 
 
 def reproject(samples, normals, known, least_cosine, out):  # type: ignore[no-untyped-def]
@@ -353,7 +358,7 @@ STEPS: dict[tuple[str, str], tuple[str, ...]] = {
         " --out {out}/session-skin".split()
     ),
     ("flash", "sequence"): tuple(
-        "simulate flash --seed 0 --scale small --sequence smile --subject III --width 512"
+        "simulate flash --seed 0 --scale small --sequence smile --subject III --width 384"
         " --out {out}/session-sequence".split()
     ),
     ("flash", "curves"): tuple(
@@ -399,6 +404,7 @@ KERNELS = (
         "pixel",
         lambda irradiance_rgb, **_: irradiance_rgb.shape[0] * irradiance_rgb.shape[1],
         expose,
+        "Poisson numbers of means below 10 are not counted",
     ),
     Kernel(
         FLASH,
@@ -543,7 +549,7 @@ KERNELS = (
         "pixel",
         lambda *args: len(args[4]),
         look_up_moments,
-        "latency of gathers",
+        "12 kB of a table per pixel, from the cache",
     ),
     Kernel(
         (("gradient", "capture"),),
@@ -589,6 +595,7 @@ KERNELS = (
         "sample",
         lambda f, *_: f.shape[0] * f.shape[1],
         fit_envelope,
+        "a bounded solution per point and step, for few samples per point at this size",
     ),
     Kernel(
         DOME,
@@ -606,7 +613,7 @@ KERNELS = (
         "sample",
         lambda *args: args[5].size,
         mix_basis,
-        "arcs of the C library",
+        "rows of the table are gathered from the cache",
     ),
     Kernel(
         DOME,
@@ -623,6 +630,7 @@ KERNELS = (
         "sample",
         lambda samples, *_: samples[5].size,
         shade,
+        "branches of each sample",
     ),
     Kernel(
         DOME,
@@ -657,6 +665,7 @@ KERNELS = (
         "pixel",
         lambda relief, places, *_: places.shape[0] * places.shape[1],
         solve_occlusion,
+        "further steps where lights are hidden are not counted",
     ),
     Kernel(
         GRADIENT,
@@ -665,7 +674,7 @@ KERNELS = (
         "pixel",
         lambda parallel, *_: parallel.shape[1],
         invert_moments,
-        "Newton's steps depend on the data",
+        "the polarization of each pixel takes up to 17 rounds of Newton's steps",
     ),
     Kernel(
         GRADIENT,
@@ -674,7 +683,7 @@ KERNELS = (
         "pixel",
         lambda y, *_: y.shape[1],
         fit_moments,
-        f"{BRANCHES}: any pattern may be missing",
+        "rows are copied to lanes and back",
     ),
     Kernel(
         GRADIENT,
@@ -683,6 +692,15 @@ KERNELS = (
         "grid point",
         lambda ax, ay, inverse, b, x, odd: 0.5 * x.size,
         smooth_grid,
+    ),
+    Kernel(
+        GRADIENT,
+        "reconstruction.normal_integration.multigrid_kernels",
+        "smooth_from_zero",
+        "grid point",
+        lambda ax, ay, inverse, b, x: x.size,
+        lambda ax, ay, inverse, b, x: Cost(sum_bytes(ax, ay, inverse, b, x), float32=5 * x.size),
+        "every other point of rows that are read whole",
     ),
     Kernel(
         (("flash", "curves"),),

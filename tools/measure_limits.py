@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,12 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
 }
 """Set before Numba and BLAS start, so that a thread's clock counts all of a kernel's work."""
-REPEATS = 7
+REPEATS = 5
 STREAM_BYTES = 1 << 26  # twice the last level of the cache
 TABLE_BYTES = 1 << 28
-MIN_CALL_S = 0.02
+MIN_CALL_S = 0.01
+MIN_SHARE = 0.005
+"""Kernels below this fraction of a step's processor time are not listed."""
 CHAIN = 16
 """Steps of each chain of multiplications and additions."""
 
@@ -242,35 +245,43 @@ def shortest_seconds(cost: Cost, rates: Mapping[str, float]) -> tuple[str, float
     return name, times[bound]
 
 
-def judge(recorder: Recorder, total_s: float, calls: Mapping[str, Any]) -> tuple[Row, Rates]:
-    """Measure rates and the kernel's largest call in turns, and compare their medians."""
-    kernel = recorder.kernel
-    share = recorder.seconds / total_s
-    if kernel.cost is None or recorder.largest is None:
-        each, nan = recorder.seconds / max(recorder.items, 1.0), math.nan
-        return Row(kernel.name, share, each, kernel.item, nan, nan, "-", nan, kernel.reason), {}
-    args, options = kernel.prepare(*recorder.largest[0]), recorder.largest[1]
-    seconds, rates = [], []
+def measure_in_turns(
+    calls: Mapping[str, tuple[float, Callable[[], object]]], kernels: Sequence[Recorder]
+) -> tuple[Rates, list[float]]:
+    """Measure rates and the kernels' largest calls in turns; return medians of both."""
+    rates: list[Rates] = []
+    seconds: list[list[float]] = []
+    replays = []
+    for one in kernels:
+        args, options = one.largest or ((), {})
+        replays.append(partial(one.plain, *one.kernel.prepare(*args), **options))
     for _ in range(REPEATS):
         rates.append({name: units / time_call(call) for name, (units, call) in calls.items()})
-        seconds.append(time_call(lambda: recorder.plain(*args, **options)))
-    rate = {name: statistics.median(one[name] for one in rates) for name in calls}
-    taken = statistics.median(seconds)
-    cost = kernel.cost(*args, **options)
-    bound, shortest = shortest_seconds(cost, rate)
-    flops = cost.float32 + cost.float64
-    row = Row(
-        kernel.name,
+        seconds.append([time_call(replay) for replay in replays])
+    middle = {name: statistics.median(one[name] for one in rates) for name in calls}
+    return middle, [statistics.median(column) for column in zip(*seconds, strict=True)]
+
+
+def judge(recorder: Recorder, total_s: float, taken_s: float, rates: Rates) -> Row:
+    """Compare the time of a kernel's largest call with the shortest one."""
+    kernel, share = recorder.kernel, recorder.seconds / total_s
+    if kernel.cost is None or recorder.largest is None:
+        each, nan = recorder.seconds / max(recorder.items, 1.0), math.nan
+        return Row(kernel.label, share, each, kernel.item, nan, nan, "-", nan, kernel.reason)
+    args, options = recorder.largest
+    cost = kernel.cost(*kernel.prepare(*args), **options)
+    bound, shortest = shortest_seconds(cost, rates)
+    return Row(
+        kernel.label,
         share,
-        taken / recorder.largest_items,
+        taken_s / recorder.largest_items,
         kernel.item,
-        1e-9 * cost.bytes / taken,
-        1e-9 * flops / taken,
+        1e-9 * cost.bytes / taken_s,
+        1e-9 * (cost.float32 + cost.float64) / taken_s,
         bound,
-        shortest / taken,
+        shortest / taken_s,
         kernel.reason,
     )
-    return row, rate
 
 
 def measure(rig: str, step: str, run: Path | None) -> dict[str, Any]:
@@ -282,14 +293,11 @@ def measure(rig: str, step: str, run: Path | None) -> dict[str, Any]:
         words = [word.format(run=run, out=folder) for word in STEPS[rig, step]]
         total_s = run_command(words)
     total_s -= sum(one.copying_s for one in recorders)
-    calls = rate_calls()
-    rows, rates = [], []
-    for one in recorders:
-        if one.calls:
-            row, rate = judge(one, total_s, calls)
-            rows.append(asdict(row))
-            rates += [rate] if rate else []
-    medians = {name: statistics.median(one[name] for one in rates) for name in calls if rates}
+    used = [one for one in recorders if one.seconds > MIN_SHARE * total_s]
+    limited = [one for one in used if one.largest is not None]
+    rates, seconds = measure_in_turns(rate_calls(), limited)
+    taken = {id(one): each for one, each in zip(limited, seconds, strict=True)}
+    rows = [asdict(judge(one, total_s, taken.get(id(one), 0.0), rates)) for one in used]
     return {
         "rig": rig,
         "step": step,
@@ -298,7 +306,7 @@ def measure(rig: str, step: str, run: Path | None) -> dict[str, Any]:
         "load": os.getloadavg()[0],
         "repeats": REPEATS,
         "processor_s": total_s,
-        "rates": medians,
+        "rates": rates,
         "rows": sorted(rows, key=lambda row: -row["share"]),
     }
 

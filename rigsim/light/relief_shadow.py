@@ -165,7 +165,7 @@ class ReliefShadow:
         return found.reshape(self._size, self._size)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
     """Sweep over the columns, from the light's side; each line drifts over the rows."""
     # The stack holds the upper convex hull of the points between the light and the current column.
@@ -193,17 +193,14 @@ def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
             own = (np.float32(1.0) - part) * field[below, column] + part * field[above, column]
             here = np.float32(column) * step
             # points of the hull that the next one hides from here never become a horizon again
-            while top > 0:
-                rise = (level[top - 1] - own) / (here - place[top - 1])
-                if top > 1:
-                    further = (level[top - 2] - own) / (here - place[top - 2])
-                    if further >= rise:
-                        top -= 1
-                        continue
-                if rise <= 0.0 and top == 1:
-                    top -= 1
-                    continue
-                break
+            # slopes are compared without their divisions
+            while top > 1:
+                rise, far = level[top - 1] - own, here - place[top - 1]
+                if (level[top - 2] - own) * far < rise * (here - place[top - 2]):
+                    break
+                top -= 1
+            if top == 1 and level[0] <= own:
+                top = 0
             if top > 0:
                 rise = (level[top - 1] - own) / (here - place[top - 1])
                 if rise > 0.0:

@@ -105,12 +105,14 @@ def test_step_runs_and_puts_its_kernels_back(costs, tool, monkeypatch):
     before = sensor.expose_sensor, exposing.expose_sensor
     record = tool.measure("flash", "capture", None)
     assert (sensor.expose_sensor, exposing.expose_sensor) == before
-    row = next(one for one in record["rows"] if one["kernel"] == "expose_sensor")
+    row = next(one for one in record["rows"] if one["kernel"] == "rigsim.sensor.expose_sensor")
     assert row["bound"] == "random numbers"
     assert 0.0 < row["share"] < 1.0
     assert 0.05 < row["fraction"] < 1.5
     lines = tool.tabulate([record])
-    assert any(line.startswith("| flash, capture: expose_sensor | ") for line in lines)
+    assert any(
+        line.startswith("| flash, capture: rigsim.sensor.expose_sensor | ") for line in lines
+    )
     assert all(line.count("|") == 6 for line in lines if "expose_sensor" in line)
 
 
