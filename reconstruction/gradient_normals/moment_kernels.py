@@ -16,39 +16,42 @@ CHI, FREE, USED, MISFIT = 11, 12, 13, 14
 MOMENT_ROWS = 15
 
 
-LANES = 64
+PIXEL_LANES = 64
 """Pixels without missing samples that are fitted together, in whole vectors."""
-_VARIANCE, _FIT, _TOP = 8 * LANES, 16 * LANES, (16 + MOMENT_ROWS) * LANES
-_LANE_NUMBERS = _TOP + LANES
+_VARIANCE, _FIT, _TOP = 8 * PIXEL_LANES, 16 * PIXEL_LANES, (16 + MOMENT_ROWS) * PIXEL_LANES
+_LANE_NUMBERS = _TOP + PIXEL_LANES
 
 
 @njit(fastmath={"contract", "nsz"}, error_model="numpy", forceinline=True)
 def _fit_lanes(s, noise_source, gain, read, dark, turn):  # type: ignore[no-untyped-def]
-    """Fit `LANES` pixels without missing samples, one round of :func:`_fit_pixel`.
+    """Fit `PIXEL_LANES` pixels without missing samples, one round of :func:`_fit_pixel`.
 
-    ``s`` has rows of `LANES` numbers: samples, variances, moments, largest sample. As one
+    ``s`` has rows of `PIXEL_LANES` numbers: samples, variances, moments, largest sample. As one
     array with constant offsets it needs no test whether rows overlap.
     """
-    for j in range(LANES):
-        full = s[FULL * LANES + j]
+    for j in range(PIXEL_LANES):
+        full = s[FULL * PIXEL_LANES + j]
         if noise_source == 2:
             top = s[_TOP + j]
-            before = s[_FIT + C_0 * LANES + j]
+            before = s[_FIT + C_0 * PIXEL_LANES + j]
             base = max(before, 0.0) if turn else top
             floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-30)
-            s[_VARIANCE + FULL * LANES + j] = max(read + gain * base, floor)
-            s[_VARIANCE + DARK * LANES + j] = max(read, floor)
+            s[_VARIANCE + FULL * PIXEL_LANES + j] = max(read + gain * base, floor)
+            s[_VARIANCE + DARK * PIXEL_LANES + j] = max(read, floor)
             for axis in range(3):
-                along = s[_FIT + (C_X + axis) * LANES + j] if turn else 0.0
+                along = s[_FIT + (C_X + axis) * PIXEL_LANES + j] if turn else 0.0
                 plus, minus = 0.5 * (base + along), 0.5 * (base - along)
-                s[_VARIANCE + (1 + axis) * LANES + j] = max(read + gain * plus, floor)
-                s[_VARIANCE + (4 + axis) * LANES + j] = max(read + gain * minus, floor)
-        w = 1.0 / s[_VARIANCE + FULL * LANES + j]
+                s[_VARIANCE + (1 + axis) * PIXEL_LANES + j] = max(read + gain * plus, floor)
+                s[_VARIANCE + (4 + axis) * PIXEL_LANES + j] = max(read + gain * minus, floor)
+        w = 1.0 / s[_VARIANCE + FULL * PIXEL_LANES + j]
         a00, a0b, abb = w, w, w
         g0, gb = w * full, w * full
         for axis in range(3):
-            both = s[(1 + axis) * LANES + j] + s[(4 + axis) * LANES + j]
-            vp, vm = s[_VARIANCE + (1 + axis) * LANES + j], s[_VARIANCE + (4 + axis) * LANES + j]
+            both = s[(1 + axis) * PIXEL_LANES + j] + s[(4 + axis) * PIXEL_LANES + j]
+            vp, vm = (
+                s[_VARIANCE + (1 + axis) * PIXEL_LANES + j],
+                s[_VARIANCE + (4 + axis) * PIXEL_LANES + j],
+            )
             w = 1.0 / (vp + vm)
             a00 += w
             a0b += 2.0 * w
@@ -57,8 +60,8 @@ def _fit_lanes(s, noise_source, gain, read, dark, turn):  # type: ignore[no-unty
             gb += 2.0 * w * both
         v00, v0b, vbb = 1.0 / a00, 0.0, 0.0
         good = True
-        below = s[DARK * LANES + j]
-        per_dark = 1.0 / s[_VARIANCE + DARK * LANES + j]
+        below = s[DARK * PIXEL_LANES + j]
+        per_dark = 1.0 / s[_VARIANCE + DARK * PIXEL_LANES + j]
         if dark:
             abb += per_dark
             gb += below * per_dark
@@ -68,18 +71,21 @@ def _fit_lanes(s, noise_source, gain, read, dark, turn):  # type: ignore[no-unty
         c0 = v00 * g0 + v0b * gb
         b = v0b * g0 + vbb * gb
         r = full - b - c0
-        misfit, chi = r * r, r * r / s[_VARIANCE + FULL * LANES + j]
+        misfit, chi = r * r, r * r / s[_VARIANCE + FULL * PIXEL_LANES + j]
         if dark:
             r = below - b
             misfit += r * r
             chi += r * r * per_dark
         if turn:  # what failed in the first round stays NaN
-            good &= s[_FIT + C_0 * LANES + j] == s[_FIT + C_0 * LANES + j]
+            good &= s[_FIT + C_0 * PIXEL_LANES + j] == s[_FIT + C_0 * PIXEL_LANES + j]
         qq = v00 + 4.0 * v0b + 4.0 * vbb
         t0 = t1 = t2 = 0.0
         for axis in range(3):
-            plus, minus = s[(1 + axis) * LANES + j], s[(4 + axis) * LANES + j]
-            vp, vm = s[_VARIANCE + (1 + axis) * LANES + j], s[_VARIANCE + (4 + axis) * LANES + j]
+            plus, minus = s[(1 + axis) * PIXEL_LANES + j], s[(4 + axis) * PIXEL_LANES + j]
+            vp, vm = (
+                s[_VARIANCE + (1 + axis) * PIXEL_LANES + j],
+                s[_VARIANCE + (4 + axis) * PIXEL_LANES + j],
+            )
             per = 1.0 / (vp + vm)
             share = vm * per
             t = 2.0 * share - 1.0
@@ -87,16 +93,16 @@ def _fit_lanes(s, noise_source, gain, read, dark, turn):  # type: ignore[no-unty
             r = plus + minus - 2.0 * b - c0
             misfit += 0.5 * r * r
             chi += r * r * per
-            s[_FIT + (C_X + axis) * LANES + j] = c if good else np.nan
-            s[_FIT + (V_XX + axis) * LANES + j] = 4.0 * vp * share + t * t * qq
+            s[_FIT + (C_X + axis) * PIXEL_LANES + j] = c if good else np.nan
+            s[_FIT + (V_XX + axis) * PIXEL_LANES + j] = 4.0 * vp * share + t * t * qq
             t0, t1, t2 = t1, t2, t
-        s[_FIT + C_0 * LANES + j] = c0 if good else np.nan
-        s[_FIT + V_0 * LANES + j] = v00
-        s[_FIT + V_XY * LANES + j] = t0 * t1 * qq
-        s[_FIT + V_XZ * LANES + j] = t0 * t2 * qq
-        s[_FIT + V_YZ * LANES + j] = t1 * t2 * qq
-        s[_FIT + CHI * LANES + j] = chi
-        s[_FIT + MISFIT * LANES + j] = misfit
+        s[_FIT + C_0 * PIXEL_LANES + j] = c0 if good else np.nan
+        s[_FIT + V_0 * PIXEL_LANES + j] = v00
+        s[_FIT + V_XY * PIXEL_LANES + j] = t0 * t1 * qq
+        s[_FIT + V_XZ * PIXEL_LANES + j] = t0 * t2 * qq
+        s[_FIT + V_YZ * PIXEL_LANES + j] = t1 * t2 * qq
+        s[_FIT + CHI * PIXEL_LANES + j] = chi
+        s[_FIT + MISFIT * PIXEL_LANES + j] = misfit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -240,11 +246,11 @@ def _gather_lanes(y, noise, noise_source, dark, start, count, s, missing):  # ty
     top = s[_TOP : _TOP + count]
     top[:] = 0.0
     for k in range(8):
-        row = s[k * LANES : k * LANES + count]
+        row = s[k * PIXEL_LANES : k * PIXEL_LANES + count]
         _copy_row(y[k, start : start + count], row)
         _note_sample(row, 1.0 if dark or k != DARK else 0.0, top, missing)
         if noise_source == 1:
-            first = _VARIANCE + k * LANES
+            first = _VARIANCE + k * PIXEL_LANES
             _copy_row(noise[k, start : start + count], s[first : first + count])
 
 
@@ -280,19 +286,19 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
     Together this is the generalized least squares of all samples in closed form.
     """
     v, s = np.empty(8), np.ones(_LANE_NUMBERS)
-    missing = np.empty(LANES)
-    for start in range(0, y.shape[1], LANES):
-        count = min(LANES, y.shape[1] - start)
+    missing = np.empty(PIXEL_LANES)
+    for start in range(0, y.shape[1], PIXEL_LANES):
+        count = min(PIXEL_LANES, y.shape[1] - start)
         end = start + count
         _gather_lanes(y, noise, noise_source, dark, start, count, s, missing[:count])
         _fit_lanes(s, noise_source, gain, read, dark, False)
         if noise_source == 2:
             _fit_lanes(s, noise_source, gain, read, dark, True)
-        first = _FIT + FREE * LANES
+        first = _FIT + FREE * PIXEL_LANES
         s[first : first + count] = 3.0  # five sums and two unknowns, or without the dark 4 and 1
-        known = s[_FIT + C_0 * LANES : _FIT + C_0 * LANES + count]
+        known = s[_FIT + C_0 * PIXEL_LANES : _FIT + C_0 * PIXEL_LANES + count]
         for row in range(MOMENT_ROWS):
-            first = _FIT + row * LANES
+            first = _FIT + row * PIXEL_LANES
             _copy_known(s[first : first + count], known, out[row, start:end])
         for p in range(start, end):
             if missing[p - start] > 0.0:
