@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numba import njit, prange
 
-from rigsim.light.surface_brdf import ETA
+from rigsim.tissue.skin_layers import ETA
 
 ELEVATION_NODES: Final = 6
 """Number of elevations for the quadrature with two boundaries: three pairs about the middle."""
