@@ -3,14 +3,11 @@
 `reconstruction.brdf_basis.evaluate` is the plain counterpart; tests compare both.
 """
 
-import math
-
 import numpy as np
-from numba import njit, prange
+from numba import float64, int64, njit, prange, uint64
 
 from reconstruction.arrays import Float32Array, Float64Array
-
-_HALF_PI = 0.5 * math.pi
+from reconstruction.brdf_basis.row_kernels import FAST_MATH, NODES_D, NODES_H, NODES_PHI, find_nodes
 
 
 def evaluate_mixtures(
@@ -50,32 +47,41 @@ def evaluate_mixtures(
     return out
 
 
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+def _find_lit(light, view, normal, lit):  # type: ignore[no-untyped-def]
+    n0, n1, n2 = float64(normal[0]), float64(normal[1]), float64(normal[2])
+    for m in range(lit.size):
+        mu_l = float64(light[m, 0]) * n0 + float64(light[m, 1]) * n1 + float64(light[m, 2]) * n2
+        mu_v = float64(view[m, 0]) * n0 + float64(view[m, 1]) * n1 + float64(view[m, 2]) * n2
+        lit[m] = (mu_l > 0.0) & (mu_v > 0.0)
+
+
 @njit(parallel=True, cache=True)
 def _mixtures(table, weights, light, view, normals, out):  # type: ignore[no-untyped-def]
-    last_d, last_phi, last_h = table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1
+    lanes = uint64(table.shape[3])
+    flat = table.reshape(-1)
+    samples = out.shape[1]
     for p in prange(out.shape[0]):
-        n0, n1, n2 = normals[p, 0], normals[p, 1], normals[p, 2]
-        for m in range(out.shape[1]):
-            l0, l1, l2 = float(light[p, m, 0]), float(light[p, m, 1]), float(light[p, m, 2])
-            v0, v1, v2 = float(view[p, m, 0]), float(view[p, m, 1]), float(view[p, m, 2])
-            mu_l = l0 * n0 + l1 * n1 + l2 * n2
-            mu_v = v0 * n0 + v1 * n1 + v2 * n2
-            if not (mu_l > 0.0 and mu_v > 0.0):
+        every, lit = np.arange(samples), np.empty(samples, np.bool_)
+        cos_l, place = np.empty(samples), np.empty((3, samples))
+        _find_lit(light[p], view[p], normals[p], lit)
+        find_nodes(light[p], view[p], normals[p], every, samples, cos_l, place)
+        share = weights[p]
+        for m in range(samples):
+            if not lit[m]:
                 continue
-            between = l0 * v0 + l1 * v1 + l2 * v2
-            cos_d = math.sqrt(min(max(0.5 * (1.0 + between), 0.0), 1.0))
-            sin_d = math.sqrt(min(max(0.5 * (1.0 - between), 0.0), 1.0))
-            cos_h = min((mu_l + mu_v) / max(2.0 * cos_d, 1e-9), 1.0)
-            sin_h = math.sqrt(1.0 - cos_h * cos_h)
-            cos_phi = min(abs(mu_v - mu_l) / max(2.0 * sin_d * sin_h, 1e-9), 1.0)
-            d = math.atan2(sin_d, cos_d) / _HALF_PI * last_d
-            h = math.sqrt(math.acos(cos_h) / _HALF_PI) * last_h
-            phi = int(math.acos(cos_phi) / _HALF_PI * last_phi + 0.5)
-            i_d, i_h = min(int(d), last_d - 1), min(int(h), last_h - 1)
-            a, b = d - i_d, h - i_h
+            d, h = place[0, m], place[2, m]
+            i_d, i_h = min(int64(d), NODES_D - 2), min(int64(h), NODES_H - 2)
+            i_phi = int64(place[1, m] + 0.5)
+            d, h = d - i_d, h - i_h
+            # unsigned offsets into a flat table, without a test for negative ones
+            a = uint64((i_d * NODES_PHI + i_phi) * NODES_H + i_h) * lanes
+            b = a + uint64(NODES_H * NODES_PHI) * lanes
+            w_a, w_b = (1.0 - d) * (1.0 - h), (1.0 - d) * h
+            w_e, w_f = d * (1.0 - h), d * h
             total = 0.0
-            for k in range(weights.shape[1]):
-                near = (1.0 - b) * table[i_d, phi, i_h, k] + b * table[i_d, phi, i_h + 1, k]
-                far = (1.0 - b) * table[i_d + 1, phi, i_h, k] + b * table[i_d + 1, phi, i_h + 1, k]
-                total += weights[p, k] * ((1.0 - a) * near + a * far)
+            for lane in range(share.size):
+                k = uint64(lane)
+                near = w_a * flat[a + k] + w_b * flat[a + lanes + k]
+                total += share[lane] * (near + w_e * flat[b + k] + w_f * flat[b + lanes + k])
             out[p, m] = total

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
-from reconstruction.arrays import Float64Array, FloatArray
+from reconstruction.arrays import Float64Array, FloatArray, Int64Array
 from reconstruction.gradient_normals.lobe_response import facet_reflectance
 from reconstruction.gradient_normals.patterns import GradientError
 from reconstruction.gradient_normals.sphere_lights import (
@@ -38,6 +38,11 @@ SOLVER_TOLERANCE: Final = 5e-4
 """Step at which the iteration ends, a tilt of 0.03 degrees: most pixels hide hardly any light."""
 MAX_PLACE: Final = 1.2
 """Largest disc position: a tilt of 74 degrees."""
+BLOCK_COLUMNS: Final = 256
+"""Pixels of a row whose horizons are found together."""
+FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp"}
+"""Reordered sums, which run in whole vectors; NaN keeps its meaning."""
+FINITE_MATH: Final = FAST_MATH | {"nnan", "ninf"}
 MIN_COSINE: Final = 1e-3
 """Smallest cosine of light or view, as in `model.brdf.microfacet`."""
 
@@ -104,8 +109,9 @@ def correct_occlusion(
     checks.within("height", relief)
     out, places = np.array(normals), np.zeros((*mask.shape, 2))
     places[mask] = disc_from_normal(np.asarray(normals[mask], np.float64))
-    tables = _light_table(lights, eta)
-    found = _solve(relief, places, _steps(pixel_um), float(pixel_um), tables, float(alpha))
+    samples = _horizon_samples(pixel_um)
+    table = _light_table(lights, eta)
+    found = _solve(np.pad(relief, samples[2], "edge"), places, samples, table, float(alpha))
     out[mask] = normal_from_disc(found[mask])
     return out
 
@@ -123,8 +129,27 @@ def _steps(pixel_um: float) -> Float64Array:
     return np.unique(np.round(HORIZON_STEP_RATIO ** np.arange(count + 1)))
 
 
-def _light_table(lights: SphereLights, eta: float) -> tuple[Float64Array, ...]:
-    """Return directions, facets, axes of the moments, weights, elevations and turns of lights."""
+def _horizon_samples(pixel_um: float) -> tuple[Int64Array, Float64Array, int]:
+    """Return where each direction samples the relief about a pixel, and how far.
+
+    Rows and columns of the upper left neighbor, shape (2, K, S); fractions down and right of it,
+    and the inverse distance in 1/um, shape (3, K, S).
+    """
+    steps = _steps(pixel_um)
+    turn = 2.0 * math.pi * np.arange(HORIZON_DIRECTIONS) / HORIZON_DIRECTIONS
+    place = np.stack([-np.outer(np.sin(turn), steps), np.outer(np.cos(turn), steps)])
+    corner = np.floor(place)
+    per_um = np.broadcast_to(1.0 / (steps * pixel_um), place.shape[1:])
+    shift = np.ascontiguousarray(corner, np.int64)
+    return shift, np.concatenate([place - corner, per_um[None]]), int(steps.max()) + 1
+
+
+def _light_table(lights: SphereLights, eta: float) -> tuple[Float64Array, Int64Array]:
+    """Return numbers of the lights, shape (12, N), and adjacent horizons, shape (2, N).
+
+    Rows: direction, facet and axis of the moments, 3 each; weight; elevation; position between the
+    adjacent horizons. Each row is contiguous, so that sums over lights run in whole vectors.
+    """
     view = np.array([0.0, 0.0, 1.0])
     way = np.asarray(lights.directions, np.float64)
     facet = way + view
@@ -133,8 +158,10 @@ def _light_table(lights: SphereLights, eta: float) -> tuple[Float64Array, ...]:
     axes = lights.programmed if len(lights.programmed) else way
     elevation = np.arctan2(way[:, 2], np.hypot(way[:, 0], way[:, 1]))
     turn = np.arctan2(way[:, 1], way[:, 0]) / (2.0 * math.pi) * HORIZON_DIRECTIONS
-    tables = (way, facet, np.asarray(axes, np.float64), weight, elevation, turn)
-    return tuple(np.ascontiguousarray(table, np.float64) for table in tables)
+    first = np.floor(turn)
+    adjacent = (np.stack([first, first + 1.0]).astype(np.int64)) % HORIZON_DIRECTIONS
+    numbers = np.vstack([way.T, facet.T, axes.T, weight, elevation, turn - first])
+    return np.ascontiguousarray(numbers, np.float64), np.ascontiguousarray(adjacent)
 
 
 @njit(cache=True)
@@ -157,84 +184,111 @@ def _to_normal(u, v):  # type: ignore[no-untyped-def]
     return u * scale, v * scale, 1.0 - 0.5 * square
 
 
-@njit(cache=True)
-def _observed(u, v, tables, horizon, alpha, hidden):  # type: ignore[no-untyped-def]
+@njit(fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+def _observed(u, v, lights, horizon, alpha, hidden):  # type: ignore[no-untyped-def]
     """Return the disc position that the lights give of a normal, with or without hidden ones."""
-    way, facet, axes, weight, elevation, turn = tables
+    numbers, adjacent = lights
     n_x, n_y, n_z = _to_normal(u, v)
     a2 = alpha * alpha
     to_view = max(n_z, MIN_COSINE)
     of_view = 0.5 * (math.sqrt(1.0 + a2 * (1.0 / to_view**2 - 1.0)) - 1.0)
     x = y = z = 0.0
-    for light in range(weight.shape[0]):
-        mu = n_x * way[light, 0] + n_y * way[light, 1] + n_z * way[light, 2]
-        if mu <= 0.0:
-            continue
-        half = n_x * facet[light, 0] + n_y * facet[light, 1] + n_z * facet[light, 2]
+    for light in range(numbers.shape[1]):
+        way_x, way_y, way_z = numbers[0, light], numbers[1, light], numbers[2, light]
+        mu = n_x * way_x + n_y * way_y + n_z * way_z
+        half = n_x * numbers[3, light] + n_y * numbers[4, light] + n_z * numbers[5, light]
         half = min(max(half, 0.0), 1.0)
-        lobe = a2 / (half * half * (a2 - 1.0) + 1.0) ** 2
+        width = half * half * (a2 - 1.0) + 1.0
         to_light = max(mu, MIN_COSINE)
-        of_light = 0.5 * (math.sqrt(1.0 + a2 * (1.0 / to_light**2 - 1.0)) - 1.0)
-        part = weight[light] * lobe * mu / ((1.0 + of_light + of_view) * to_light)
+        of_light = 0.5 * (math.sqrt(1.0 + a2 * (1.0 / (to_light * to_light) - 1.0)) - 1.0)
+        part = numbers[9, light] * a2 * max(mu, 0.0)
+        part /= width * width * (1.0 + of_light + of_view) * to_light
         if hidden:
-            first = math.floor(turn[light])
-            rest = turn[light] - first
-            edge = (1.0 - rest) * horizon[int(first) % HORIZON_DIRECTIONS]
-            edge += rest * horizon[int(first + 1) % HORIZON_DIRECTIONS]
-            free = 0.5 + 0.5 * (elevation[light] - edge) / HORIZON_SOFTNESS_RAD
+            rest = numbers[11, light]
+            edge = (1.0 - rest) * horizon[adjacent[0, light]] + rest * horizon[adjacent[1, light]]
+            free = 0.5 + (0.5 / HORIZON_SOFTNESS_RAD) * (numbers[10, light] - edge)
             part *= min(max(free, 0.0), 1.0)
-        x += part * axes[light, 0]
-        y += part * axes[light, 1]
-        z += part * axes[light, 2]
+        x += part * numbers[6, light]
+        y += part * numbers[7, light]
+        z += part * numbers[8, light]
     return _place(x, y, z)
 
 
-@njit(cache=True)
-def _fill_horizon(relief, row, column, steps, pixel_um, horizon):  # type: ignore[no-untyped-def]
-    """Find the elevations of a pixel's horizon, rad; return the highest. 0 is the plane."""
-    height, width = relief.shape
-    highest = 0.0
+@njit(fastmath=FINITE_MATH, error_model="numpy", forceinline=True)
+def _raise_tangents(upper, lower, own, down, right, per_um, tangent):  # type: ignore[no-untyped-def]
+    """Raise the horizons of neighboring pixels by one sample of each, between four neighbors."""
+    for c in range(own.size):
+        above = upper[c] + right * (upper[c + 1] - upper[c])
+        below = lower[c] + right * (lower[c + 1] - lower[c])
+        there = above + down * (below - above)
+        tangent[c] = max(tangent[c], (there - own[c]) * per_um)
+
+
+@njit(fastmath=FINITE_MATH, error_model="numpy", forceinline=True)
+def _convert_to_elevations(tangent):  # type: ignore[no-untyped-def]
+    """Replace tangents >= 0 by elevations, within 1e-11 rad, in whole vectors."""
+    for c in range(tangent.size):
+        x = tangent[c]
+        x = x / (1.0 + math.sqrt(1.0 + x * x))
+        x = x / (1.0 + math.sqrt(1.0 + x * x))  # tangent of a fourth of the angle, below 0.42
+        q, arc = x * x, -1.0 / 23.0
+        for n in (21.0, -19.0, 17.0, -15.0, 13.0, -11.0, 9.0, -7.0, 5.0, -3.0, 1.0):
+            arc = 1.0 / n + q * arc
+        tangent[c] = 4.0 * x * arc
+
+
+@njit(cache=True, nogil=True)
+def _fill_horizons(relief, row, begin, samples, tangent, horizon):  # type: ignore[no-untyped-def]
+    """Find the elevations of the horizons of a row's pixels, rad; 0 is the plane.
+
+    ``relief`` has a margin that repeats its edge, so that a sample has the same neighbors and
+    weights at each pixel.
+    """
+    shift, weight, margin = samples
+    count = horizon.shape[0]
+    left = begin + margin
+    own = relief[row + margin, left : left + count]
     for k in range(HORIZON_DIRECTIONS):
-        turn = 2.0 * math.pi * k / HORIZON_DIRECTIONS
-        sine, cosine = math.sin(turn), math.cos(turn)
-        tangent = 0.0
-        for step in steps:
-            y = min(max(row - step * sine, 0.0), height - 1.0)
-            x = min(max(column + step * cosine, 0.0), width - 1.0)
-            i, j = int(y), int(x)
-            below, right = min(i + 1, height - 1), min(j + 1, width - 1)
-            v, u = y - i, x - j
-            upper = relief[i, j] + u * (relief[i, right] - relief[i, j])
-            lower = relief[below, j] + u * (relief[below, right] - relief[below, j])
-            there = upper + v * (lower - upper)
-            tangent = max(tangent, (there - relief[row, column]) / (step * pixel_um))
-        horizon[k] = math.atan(tangent)
-        highest = max(highest, horizon[k])
-    return highest
+        line = tangent[k, :count]
+        line[:] = 0.0
+        for s in range(shift.shape[2]):
+            i, j = row + margin + shift[0, k, s], left + shift[1, k, s]
+            upper, lower = relief[i, j : j + count + 1], relief[i + 1, j : j + count + 1]
+            _raise_tangents(
+                upper, lower, own, weight[0, k, s], weight[1, k, s], weight[2, k, s], line
+            )
+        _convert_to_elevations(line)
+        for c in range(count):
+            horizon[c, k] = line[c]
 
 
 @njit(parallel=True, cache=True)
-def _solve(relief, places, steps, pixel_um, tables, alpha):  # type: ignore[no-untyped-def]
+def _solve(relief, places, samples, lights, alpha):  # type: ignore[no-untyped-def]
     """Find the disc positions whose visible lights give what all lights give of `places`."""
-    height, width = relief.shape
+    height, width = places.shape[:2]
     out = places.copy()
     for row in prange(height):
-        horizon = np.empty(HORIZON_DIRECTIONS)
-        for column in range(width):
-            if _fill_horizon(relief, row, column, steps, pixel_um, horizon) == 0.0:
-                continue
-            u, v = places[row, column, 0], places[row, column, 1]
-            wanted_u, wanted_v = _observed(u, v, tables, horizon, alpha, False)
-            for _ in range(SOLVER_STEPS):
-                now_u, now_v = _observed(u, v, tables, horizon, alpha, True)
-                step_u, step_v = wanted_u - now_u, wanted_v - now_v
-                if math.isnan(step_u):  # no light is left
-                    break
-                u, v = u + step_u, v + step_v
-                size = math.sqrt(u * u + v * v)
-                if size > MAX_PLACE:
-                    u, v = u * MAX_PLACE / size, v * MAX_PLACE / size
-                if math.sqrt(step_u * step_u + step_v * step_v) < SOLVER_TOLERANCE:
-                    break
-            out[row, column, 0], out[row, column, 1] = u, v
+        tangent = np.empty((HORIZON_DIRECTIONS, BLOCK_COLUMNS))
+        horizons = np.empty((BLOCK_COLUMNS, HORIZON_DIRECTIONS))
+        for begin in range(0, width, BLOCK_COLUMNS):
+            end = min(begin + BLOCK_COLUMNS, width)
+            _fill_horizons(relief, row, begin, samples, tangent, horizons[: end - begin])
+            for column in range(begin, end):
+                horizon = horizons[column - begin]
+                if horizon.max() == 0.0:
+                    continue
+                u, v = places[row, column, 0], places[row, column, 1]
+                wanted_u, wanted_v = _observed(u, v, lights, horizon, alpha, False)
+                for _ in range(SOLVER_STEPS):
+                    now_u, now_v = _observed(u, v, lights, horizon, alpha, True)
+                    step_u, step_v = wanted_u - now_u, wanted_v - now_v
+                    if math.isnan(step_u):  # no light is left
+                        break
+                    u, v = u + step_u, v + step_v
+                    size = math.sqrt(u * u + v * v)
+                    if size > MAX_PLACE:
+                        u, v = u * MAX_PLACE / size, v * MAX_PLACE / size
+                    if math.sqrt(step_u * step_u + step_v * step_v) < SOLVER_TOLERANCE:
+                        break
+                out[row, column, 0], out[row, column, 1] = u, v
     return out

@@ -357,6 +357,13 @@ def _cubic(t):  # type: ignore[no-untyped-def]
     return a, b, np.float32(1.0) - a - b - d, d
 
 
+@njit(fastmath=True, forceinline=True)
+def _add_four(a, b, c, d, p, q, r, s, out):  # type: ignore[no-untyped-def]
+    """Add four weighted nodes: the sum is read and written once for them."""
+    for k in range(out.size):
+        out[k] += (a * p[k] + b * q[k]) + (c * r[k] + d * s[k])
+
+
 @njit(parallel=True, cache=True, fastmath=True)
 def _lookup(values, half_field, reach, least_z, normals, x, y, alphas, out):  # type: ignore[no-untyped-def]
     fields, size = values.shape[1], values.shape[3]
@@ -386,12 +393,16 @@ def _lookup(values, half_field, reach, least_z, normals, x, y, alphas, out):  # 
             if weight == np.float32(0.0):
                 continue
             for r in range(4):
-                for c in range(4):
-                    share = weight * a[c] * b[r]
-                    for k in range(values.shape[5]):
-                        out[i, k] += (
-                            share
-                            * values[
-                                level, low + n // 2, left + n % 2, row + r - 1, column + c - 1, k
-                            ]
-                        )
+                line = values[level, low + n // 2, left + n % 2, row + r - 1]
+                share = weight * b[r]
+                _add_four(
+                    share * a[0],
+                    share * a[1],
+                    share * a[2],
+                    share * a[3],
+                    line[column - 1],
+                    line[column],
+                    line[column + 1],
+                    line[column + 2],
+                    out[i],
+                )

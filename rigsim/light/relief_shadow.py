@@ -24,7 +24,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float32Array
-from rigsim.light.surface_brdf import transmittance
+from rigsim.light.hidden_sky_kernels import add_sector, add_sector_through
 from rigsim.subject import SimulatedSubject
 
 HORIZON_DIRECTIONS: Final = 24
@@ -165,7 +165,7 @@ class ReliefShadow:
         return found.reshape(self._size, self._size)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
     """Sweep over the columns, from the light's side; each line drifts over the rows."""
     # The stack holds the upper convex hull of the points between the light and the current column.
@@ -193,17 +193,14 @@ def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
             own = (np.float32(1.0) - part) * field[below, column] + part * field[above, column]
             here = np.float32(column) * step
             # points of the hull that the next one hides from here never become a horizon again
-            while top > 0:
-                rise = (level[top - 1] - own) / (here - place[top - 1])
-                if top > 1:
-                    further = (level[top - 2] - own) / (here - place[top - 2])
-                    if further >= rise:
-                        top -= 1
-                        continue
-                if rise <= 0.0 and top == 1:
-                    top -= 1
-                    continue
-                break
+            # slopes are compared without their divisions
+            while top > 1:
+                rise, far = level[top - 1] - own, here - place[top - 1]
+                if (level[top - 2] - own) * far < rise * (here - place[top - 2]):
+                    break
+                top -= 1
+            if top == 1 and level[0] <= own:
+                top = 0
             if top > 0:
                 rise = (level[top - 1] - own) / (here - place[top - 1])
                 if rise > 0.0:
@@ -286,12 +283,6 @@ def _visible_fractions(  # type: ignore[no-untyped-def]
                 out[light, i] = min(max(seen, 0.0), 1.0)
 
 
-ELEVATION_NODES: Final = 6
-"""Number of elevations for the quadrature with two boundaries."""
-
-_ELEVATION_QUADRATURE: Final = np.polynomial.legendre.leggauss(ELEVATION_NODES)
-
-
 def hidden_sky_fraction(
     height_um: Float32Array,
     normals: Float32Array,
@@ -329,7 +320,8 @@ def hidden_sky_fraction(
     In a direction with the normal's part n_t along it and n_z up, between the point's own tangent
     plane at elevation a and the horizon at b, ``int (n_t cos e + n_z sin e) cos e de`` is
     ``n_t (e / 2 + sin 2e / 4) + n_z sin^2 e / 2`` from a to b; with boundaries it is summed at
-    `ELEVATION_NODES` elevations. Level skin around the field hides the sky below the horizontal.
+    `ELEVATION_NODES` of `rigsim.light.hidden_sky_kernels`. Level skin around the field hides the
+    sky below the horizontal.
 
     Examples
     --------
@@ -344,51 +336,14 @@ def hidden_sky_fraction(
     """
     out = np.zeros(normals.shape[:2], np.float32)
     normals = np.ascontiguousarray(normals, np.float32)
+    planes = np.ascontiguousarray(np.moveaxis(normals, -1, 0)) if boundaries else normals
     inner = slice(margin, -margin or None)
     for k in range(sectors):
         angle = 2.0 * math.pi * k / sectors
         tangent = horizon_tangent(height_um, pixel_um=pixel_um, azimuth_rad=angle)
         part = np.ascontiguousarray(tangent[inner, inner])
         if boundaries:
-            _add_through(out, normals, part, angle, 2.0 / sectors, *_ELEVATION_QUADRATURE)
+            add_sector_through(out, planes, part, angle, 2.0 / sectors)
         else:
-            _add(out, normals, part, angle, 2.0 / sectors)
+            add_sector(out, normals, part, angle, 2.0 / sectors)
     return np.clip(out, 0.0, 1.0)
-
-
-@njit(parallel=True, cache=True)
-def _add(out, normals, tangent, angle, share):  # type: ignore[no-untyped-def]
-    """Add one sector's hidden fraction; ``share`` is its width over pi."""
-    right, up = math.cos(angle), math.sin(angle)
-    for i in prange(out.shape[0]):
-        for j in range(out.shape[1]):
-            along = normals[i, j, 0] * right + normals[i, j, 1] * up
-            upward = normals[i, j, 2]
-            low = math.atan2(-along, upward)
-            high = math.atan(tangent[i, j])
-            if high <= low:
-                continue
-            ends = (high - low) / 2.0 + (math.sin(2.0 * high) - math.sin(2.0 * low)) / 4.0
-            rise = (math.sin(high) ** 2 - math.sin(low) ** 2) / 2.0
-            out[i, j] += share * (along * ends + upward * rise)
-
-
-@njit(parallel=True, cache=True)
-def _add_through(out, normals, tangent, angle, share, nodes, weights):  # type: ignore[no-untyped-def]
-    """Add one sector's hidden fraction with the transmittance of two boundaries."""
-    right, up = math.cos(angle), math.sin(angle)
-    for i in prange(out.shape[0]):
-        for j in range(out.shape[1]):
-            along = normals[i, j, 0] * right + normals[i, j, 1] * up
-            upward = normals[i, j, 2]
-            low = math.atan2(-along, upward)
-            high = math.atan(tangent[i, j])
-            if high <= low:
-                continue
-            total = 0.0
-            for k in range(nodes.shape[0]):
-                e = 0.5 * (low + high) + 0.5 * (high - low) * nodes[k]
-                cosine = along * math.cos(e) + upward * math.sin(e)
-                passed = transmittance(min(cosine, 1.0)) if cosine > 0.0 else 0.0
-                total += weights[k] * cosine * math.cos(e) * passed * passed
-            out[i, j] += share * 0.5 * (high - low) * total

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+from numba import njit, prange
 
 from capture.rig import Light, Rig, View
 from rigsim import shading
@@ -127,10 +128,27 @@ class CameraHits:
     def average(self, rows: Float32Array) -> Float32Array:
         """Average hits, (n, C), over each pixel's covered part, shape (H, W, C); zero elsewhere."""
         out = np.zeros((self.shape[0] * self.shape[1], rows.shape[1]), np.float32)
-        if len(rows):
-            count = np.diff(self.first).astype(np.float32)
-            out[self.pixel] = np.add.reduceat(rows, self.first[:-1], axis=0) / count[:, None]
+        _average_hits(np.ascontiguousarray(rows, np.float32), self.pixel, self.first, out)
         return out.reshape(*self.shape, rows.shape[1])
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _average_hits(rows, pixel, first, out):  # type: ignore[no-untyped-def]
+    for p in prange(pixel.shape[0]):
+        mean = out[pixel[p]]
+        # the order of NumPy's `add.reduceat`, so that images keep their digits
+        for i in range(first[p] + 1, first[p + 1]):
+            _add_row(rows[i], mean)
+        _add_row(rows[first[p]], mean)
+        count = np.float32(first[p + 1] - first[p])
+        for c in range(mean.size):
+            mean[c] /= count
+
+
+@njit(error_model="numpy", forceinline=True)
+def _add_row(row, total):  # type: ignore[no-untyped-def]
+    for c in range(total.size):
+        total[c] += row[c]
 
 
 class FastSurface:
