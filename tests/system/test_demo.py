@@ -65,7 +65,7 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
         monkeypatch.setitem(RIGS, rig, lambda *_, made=made: made.mkdir())
     built = []
 
-    def build(paths, *, title, reload_s):
+    def build(paths, *, title, reload_s, folder):
         built.append(([path.name for path in paths], title, reload_s))
         return f"report {len(built)}"
 
