@@ -64,7 +64,7 @@ def fit_skin_colors(camera: str, illuminant: str) -> tuple[Float64Array, float]:
         color_table.build(*pair, size=SKIN_NODES, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
         for pair in ((camera, illuminant), (spectra.LINEAR_SRGB, MATRIX_ILLUMINANT))
     )
-    matrix = np.linalg.lstsq(measured, shown, rcond=None)[0]
+    matrix = np.asarray(np.linalg.lstsq(measured, shown, rcond=None)[0], np.float64)
     return matrix, float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
 
 

@@ -38,19 +38,25 @@ from skinrig.rendering.lights import Light
 from skinrig.rendering.render import Rendering, render_light_groups
 from skinrig.viewer.map_filling import fill_holes
 
-LIGHTS: Final = {"left": -75.0, "half left": -40.0, "front": 0.0, "half right": 40.0, "right": 75.0}
+LIGHT_AZIMUTHS_DEG: Final = {
+    "left": -75.0,
+    "half left": -40.0,
+    "front": 0.0,
+    "half right": 40.0,
+    "right": 75.0,
+}
 """Azimuth of each light, degrees, positive to the right of the image."""
 LIGHT_ELEVATION_DEG: Final = 25.0
 LIGHT_RADIUS_RAD: Final = 0.035
 """Angular radius of a light; its shadows have soft borders."""
 SHADOW_SAMPLES: Final = 2
-FILL: Final = 0.3
+FILL_WEIGHT: Final = 0.3
 """Weight of the mean over all lights, which fills the shadows."""
 CAMERA_MM: Final = (0.0, 0.0, 700.0)
 TARGET_MM: Final = (0.0, 8.0, 0.0)
 FIELD_OF_VIEW_DEG: Final = 15.6
 """Of the longer side: 192 mm at the origin of the rig, from the crown to the neck."""
-BACKGROUND: Final = np.array([40.0, 42.0, 45.0])
+BACKGROUND_CODES: Final = np.array([40.0, 42.0, 45.0])
 """8-bit sRGB."""
 
 
@@ -186,7 +192,7 @@ def _render_step(
     elevation = np.radians(LIGHT_ELEVATION_DEG)
     across, up = float(np.cos(elevation)), float(np.sin(elevation))
     lights = []
-    for name, azimuth_deg in LIGHTS.items():
+    for name, azimuth_deg in LIGHT_AZIMUTHS_DEG.items():
         turn = np.radians(azimuth_deg)
         towards = float(np.sin(turn)) * across, up, float(np.cos(turn)) * across
         lights.append([Light(name=name, direction=towards, radius=LIGHT_RADIUS_RAD)])
@@ -197,12 +203,12 @@ def _render_step(
 def _develop(steps: list[tuple[Rendering, ...]]) -> UInt8Array:
     """Return display images, (L, S, H, W, 3), of one exposure, with filled shadows."""
     radiance = np.stack([[one.radiance for one in step] for step in steps], axis=1)
-    radiance = radiance + FILL * radiance.mean(axis=0)
+    radiance = radiance + FILL_WEIGHT * radiance.mean(axis=0)
     coverage = np.stack([step[0].coverage for step in steps])[..., None]
-    front = list(LIGHTS).index("front")
+    front = list(LIGHT_AZIMUTHS_DEG).index("front")
     exposure = choose_exposure(radiance[front, 0], coverage[0, ..., 0])
     skin = apply_tone_curve(radiance / np.maximum(coverage, 1e-3), exposure)
-    mixed = skin * coverage + BACKGROUND * (1.0 - coverage)
+    mixed = skin * coverage + BACKGROUND_CODES * (1.0 - coverage)
     return np.rint(mixed).astype(np.uint8).reshape(N_LIGHTS, N_STEPS, *FRAME_PX[::-1], 3)
 
 
@@ -229,7 +235,7 @@ def write_finished_face(
         "person": person,
         "expression": face.expression,
         "weights": face.weights,
-        "lights": LIGHTS,
+        "lights": LIGHT_AZIMUTHS_DEG,
         "blood_fraction": face.blood_fraction,
         "errors": errors,
         "left_out": face.left_out,

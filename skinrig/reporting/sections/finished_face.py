@@ -10,7 +10,7 @@ from skinrig.drawing.png import to_data_url
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, LIVE_PAGE, SHEET_FILE
 from skinrig.reporting import page
 
-HEADING = "The finished face"
+SECTION_TITLE = "The finished face"
 
 
 def section(folder: Path, number: int, report_folder: Path | None) -> Iterator[page.Block]:
@@ -32,7 +32,7 @@ def section(folder: Path, number: int, report_folder: Path | None) -> Iterator[p
         link = Path(os.path.relpath(live.resolve(), report_folder.resolve())).as_posix()
     width, height = frame_sheet.FRAME_PX
     lights = list(document["lights"])
-    yield page.Heading(HEADING, level=2)
+    yield page.Heading(SECTION_TITLE, level=2)
     yield page.build_view(
         "finished_face",
         index=number,

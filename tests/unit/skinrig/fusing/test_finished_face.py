@@ -17,7 +17,11 @@ from reconstruction.pipeline.dome.lobes import _basis_bytes
 from rigsim.subject import make_subject
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.fusing import finished_face
-from skinrig.fusing.finished_face import LIGHTS, render_finished_face, write_finished_face
+from skinrig.fusing.finished_face import (
+    LIGHT_AZIMUTHS_DEG,
+    render_finished_face,
+    write_finished_face,
+)
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SHEET_FILE
 from skinrig.fusing.sources import FusionInputError
 
@@ -97,7 +101,7 @@ def test_light_direction_brightens_its_side_of_the_face(still_blood):
     level = linear(frames[:, 0]).mean(axis=-1)
     half = FRAME_PX[0] // 2
     contrast = level[..., :half].sum(axis=(1, 2)) / level[..., half:].sum(axis=(1, 2))
-    assert list(LIGHTS) == ["left", "half left", "front", "half right", "right"]
+    assert list(LIGHT_AZIMUTHS_DEG) == ["left", "half left", "front", "half right", "right"]
     assert contrast[0] > 1.5
     assert contrast[4] < 1 / 1.5
     assert np.all(np.diff(contrast) < 0.0)

@@ -39,7 +39,7 @@ def test_buttons_and_caption_describe_the_face(folder):
     assert "no rig measures it" in part
 
 
-def test_page_links_the_live_page_only_where_it_is(folder, tmp_path):
+def test_live_page_is_linked_where_it_exists(folder, tmp_path):
     assert "skinrig view" in report.build([folder], folder=folder)
     (folder / "person.html").write_text("<html></html>")
     elsewhere = tmp_path / "pages"
