@@ -6,6 +6,7 @@ no rig measures it in the demo.
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +31,7 @@ from skinrig.errors import require_choice
 from skinrig.fusing.double import FusedDouble
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SCHEMA, SHEET_FILE
 from skinrig.fusing.sources import FusionInputError
-from skinrig.rendering.camera import look_at
+from skinrig.rendering.camera import Camera, look_at
 from skinrig.rendering.folder import apply_tone_curve, choose_exposure
 from skinrig.rendering.geometry import FittedSurface, read_own_mesh
 from skinrig.rendering.hole_patches import close_holes
@@ -181,23 +182,42 @@ class _MovingColor:
         return dataclasses.replace(self.model, r_d=r_d)
 
 
+def aim_camera(size_px: tuple[int, int]) -> Camera:
+    """Return the camera in front of a face in a dome's frame; `size_px` is width and height."""
+    return look_at(
+        CAMERA_MM, target_mm=TARGET_MM, fov_deg=FIELD_OF_VIEW_DEG, size_px=size_px, name="front"
+    )
+
+
+def build_lights(azimuths_deg: Mapping[str, float]) -> tuple[Light, ...]:
+    """Return distant lights at one elevation, by name and azimuth, degrees, positive to the right.
+
+    Examples
+    --------
+    >>> right, = build_lights({"right": 90.0})
+    >>> [round(x, 2) for x in right.direction]
+    [0.91, 0.42, 0.0]
+    """
+    elevation = np.radians(LIGHT_ELEVATION_DEG)
+    across, up = float(np.cos(elevation)), float(np.sin(elevation))
+    lights = []
+    for name, azimuth_deg in azimuths_deg.items():
+        turn = np.radians(azimuth_deg)
+        towards = float(np.sin(turn)) * across, up, float(np.cos(turn)) * across
+        lights.append(Light(name=name, direction=towards, radius=LIGHT_RADIUS_RAD))
+    return tuple(lights)
+
+
 def _render_step(
     model: SkinReflectance, rest: Mesh, moved_mm: Float32Array
 ) -> tuple[Rendering, ...]:
     """Render a moved face, one image per light."""
     mesh = build_mesh(rest.vertices_mm + moved_mm, rest.faces, rest.uv)
-    camera = look_at(
-        CAMERA_MM, target_mm=TARGET_MM, fov_deg=FIELD_OF_VIEW_DEG, size_px=FRAME_PX, name="front"
-    )
-    elevation = np.radians(LIGHT_ELEVATION_DEG)
-    across, up = float(np.cos(elevation)), float(np.sin(elevation))
-    lights = []
-    for name, azimuth_deg in LIGHT_AZIMUTHS_DEG.items():
-        turn = np.radians(azimuth_deg)
-        towards = float(np.sin(turn)) * across, up, float(np.cos(turn)) * across
-        lights.append([Light(name=name, direction=towards, radius=LIGHT_RADIUS_RAD)])
     surface = FittedSurface.of(model, mesh, rest=rest)
-    return render_light_groups(surface, camera, lights, subpixels=1, shadow_samples=SHADOW_SAMPLES)
+    lights = [[light] for light in build_lights(LIGHT_AZIMUTHS_DEG)]
+    return render_light_groups(
+        surface, aim_camera(FRAME_PX), lights, subpixels=1, shadow_samples=SHADOW_SAMPLES
+    )
 
 
 def _develop(steps: list[tuple[Rendering, ...]]) -> UInt8Array:

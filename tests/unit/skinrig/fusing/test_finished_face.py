@@ -5,17 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fixtures.finished_faces import HEAD_BLOOD, HEAD_MELANIN, HEAD_PX, matte_head
 
 from model import color_table, spectra
-from model.brdf import tables as brdf_tables
 from model.facial_color import HemoglobinRig
 from model.facial_color.document import RIG_DOCUMENT, to_maps
-from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from model.skin_reflectance import BASIS_FILE
+from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.pipeline.dome.lobes import _basis_bytes
-from rigsim.subject import make_subject
-from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.fusing import finished_face
 from skinrig.fusing.finished_face import (
     LIGHT_AZIMUTHS_DEG,
@@ -25,33 +21,14 @@ from skinrig.fusing.finished_face import (
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SHEET_FILE
 from skinrig.fusing.sources import FusionInputError
 
-SIZE = 64
 FRAME_PX = (48, 54)
-MELANIN, BLOOD = 0.02, 0.01
 BACKGROUND = (40, 42, 45)
 
 
 @pytest.fixture(scope="module")
 def head():
-    """Return matte maps of one color on the procedural head, its texels and its bands."""
-    subject = make_subject("III", seed=0, size=SIZE)
-    atlas = subject.atlas
-    same = np.ones((SIZE, SIZE), np.float32)
-    r_d = same[..., None] * np.array([0.4, 0.3, 0.2], np.float32)
-    matte = brdf_tables.tabulate({"none": lambda light, view: np.zeros(light.shape[:-1])})
-    maps = {
-        "position": SkinMap(atlas.position_mm, "mm", valid=atlas.covered),
-        "normals": SkinMap(atlas.normal, "1", valid=atlas.covered),
-        "r_d": SkinMap(r_d, "1", valid=atlas.covered),
-        "basis_weight_0": SkinMap(same, "1", valid=atlas.covered),
-        "melanin": SkinMap(MELANIN * same, MAP_UNITS["melanin"], valid=atlas.covered),
-        "hemoglobin": SkinMap(BLOOD * same, MAP_UNITS["hemoglobin"], valid=atlas.covered),
-    }
-    files = {
-        BASIS_FILE: _basis_bytes(matte, 1, {1: (np.eye(1), 0.0)}),
-        "mesh.obj": FramedMesh.of(subject.mesh).to_obj(1.0, "mm").encode(),
-    }
-    return SkinAppearance(maps, "simulated", files=files), atlas.covered
+    """Return matte maps of one color on the procedural head, and its texels."""
+    return matte_head()
 
 
 def person(head, *, rigs=("dome",), placed=True):
@@ -70,7 +47,7 @@ def person(head, *, rigs=("dome",), placed=True):
 
 def moving(blood):
     """Return a hemoglobin rig whose anger has this blood volume fraction everywhere."""
-    rest = np.full((SIZE, SIZE), BLOOD)
+    rest = np.full((HEAD_PX, HEAD_PX), HEAD_BLOOD)
     rig = HemoglobinRig.from_maps(rest, {"anger": np.full_like(rest, blood)}, radius_px=6.0)
     maps, document = to_maps(rig)
     return SkinAppearance(maps, "simulated", files={RIG_DOCUMENT: document})
@@ -86,7 +63,7 @@ def small_frames(head, blood):
 @pytest.fixture(scope="module")
 def still_blood(head):
     """Return frames of a face whose blood stays."""
-    return small_frames(head, BLOOD)
+    return small_frames(head, HEAD_BLOOD)
 
 
 def linear(frames):
@@ -124,7 +101,7 @@ def test_blood_changes_color_by_table_ratio(head, still_blood):
     more = 0.03
     still, blushed = (linear(one[2, -1]) for one in (still_blood, small_frames(head, more)))
     table = color_table.build(spectra.LINEAR_SRGB, "D65", anisotropy=ANISOTROPY_SKIN)
-    expected = table.lookup(MELANIN, more) / table.lookup(MELANIN, BLOOD)
+    expected = table.lookup(HEAD_MELANIN, more) / table.lookup(HEAD_MELANIN, HEAD_BLOOD)
     lit = (still.min(axis=-1) > 0.1) & (still.max(axis=-1) < 0.7)
     assert lit.sum() > 200
     found = np.median(blushed[lit] / still[lit], axis=0)
@@ -137,14 +114,16 @@ def test_blood_changes_color_by_table_ratio(head, still_blood):
 )
 def test_person_without_both_rigs_is_refused(head, changes, says):
     with pytest.raises(FusionInputError, match=says):
-        render_finished_face(person(head, **changes), moving(BLOOD), expression="anger", seed=0)
+        render_finished_face(
+            person(head, **changes), moving(HEAD_BLOOD), expression="anger", seed=0
+        )
 
 
 def test_unknown_expression_is_refused(head):
     with pytest.raises(FusionInputError, match="yawn"):
-        render_finished_face(person(head), moving(BLOOD), expression="yawn", seed=0)
+        render_finished_face(person(head), moving(HEAD_BLOOD), expression="yawn", seed=0)
     with pytest.raises(FusionInputError, match="smile"):
-        render_finished_face(person(head), moving(BLOOD), expression="smile", seed=0)
+        render_finished_face(person(head), moving(HEAD_BLOOD), expression="smile", seed=0)
 
 
 def test_written_folder_names_person_and_omissions(head, tmp_path):
