@@ -82,7 +82,7 @@ def test_sides_are_balanced_and_order_follows_seed(tool, folders):
     np.testing.assert_allclose(left.mean(axis=0), 0.5, atol=4 * 0.5 / 400**0.5)
 
 
-def test_all_answers_for_one_side_have_closed_form_interval(tool, folders):
+def test_unanimous_answers_have_closed_form_interval(tool, folders):
     _, key = tool.make_sheet(*folders, seed=1)
     chosen = ["left" if one["left"] == "A" else "right" for one in key["trials"]]
     found = tool.evaluate(key, answers(key, chosen) + answers(key, chosen, "P2"))
