@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.subject import expressions
 from skinrig import consent
 from skinrig.applying.expression import read_hemoglobin_rig
-from skinrig.arrays import Float32Array, Float64Array, UInt8Array
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt8Array
 from skinrig.atomic_file import replace_folder_atomically
 from skinrig.capturing.camera_colors import fit_skin_colors
 from skinrig.console import to_json_value
@@ -134,12 +134,12 @@ class _MovingColor:
     model: SkinReflectance
     """Fitted model with R_d in linear sRGB, at rest."""
     melanin: Float64Array
-    """Volume fraction of the texels of `changes`, shape (n,)."""
+    """Volume fraction of the chosen texels, shape (n,)."""
     blood: Float64Array
     """Volume fraction at rest, shape (n,)."""
     change: Float64Array
     """Its measured change to the full expression, shape (n,)."""
-    changes: Any
+    texels: BoolArray
     """(H, W): texels with chromophores."""
     known_fraction: float
     table: color_table.ColorTable
@@ -178,7 +178,7 @@ class _MovingColor:
         ratio = self.table.lookup(self.melanin, moved)
         ratio = ratio / self.table.lookup(self.melanin, self.blood)
         r_d = np.array(self.model.r_d)
-        r_d[self.changes] *= ratio.astype(np.float32)
+        r_d[self.texels] *= ratio.astype(np.float32)
         return dataclasses.replace(self.model, r_d=r_d)
 
 

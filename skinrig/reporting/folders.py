@@ -67,8 +67,8 @@ class ReportInputs:
     def _describe_source(self) -> str:
         """Return whether people were measured, by the sources that the folders record."""
         sources = []
-        for path in (*self.appearances.values(), *self.sessions):
-            for name in (store.DOCUMENT_FILE, "session.json"):
+        for path in (*self.appearances.values(), *self.sessions, *self.faces):
+            for name in (store.DOCUMENT_FILE, "session.json", FACE_DOCUMENT):
                 with contextlib.suppress(OSError, ValueError, AttributeError):
                     sources.append(json.loads((path / name).read_bytes()).get("source"))
         if not sources:

@@ -62,9 +62,20 @@ def test_two_faces_have_buttons_of_their_own(folder):
 
 def test_face_alone_is_a_report_without_requests(folder):
     html = report.build([folder / "finished-face"])
-    assert "Contents: 1 finished face." in html
+    assert "Contents: 1 finished face. All data are simulated; no person was measured." in html
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     assert html == report.build([folder / "finished-face"])
+
+
+def test_consent_of_measured_person_is_listed(tmp_path):
+    write_face(tmp_path / "face", source="measured")
+    html = report.build([tmp_path / "face"])
+    part = html[html.index('<h2 id="consent">') :]
+    assert re.search("unknown.*nothing.*face", part, re.DOTALL)
+    assert "All data are measured." in html
+    simulated = report.build([write_face(tmp_path / "simulated")])
+    assert 'id="consent"' not in simulated
+    assert "All data are simulated; no person was measured." in simulated
 
 
 def test_textured_sheet_stays_below_its_size(tmp_path):
