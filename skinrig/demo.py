@@ -202,7 +202,7 @@ def _write_report(out: Path, rigs: Iterable[str], results: _Part, *, preliminary
         paths = [one for one in sorted(out.iterdir()) if done & set(one.name.split("-"))]
         paths.append(written)
         title += f": {', '.join(rig for rig in RIGS if rig in done)}; other rigs follow"
-    html = build(paths, title=title, reload_s=RELOAD_S if preliminary else None)
+    html = build(paths, title=title, reload_s=RELOAD_S if preliminary else None, folder=out)
     write_atomically(out / REPORT_NAME, html)
 
 

@@ -33,6 +33,8 @@ DEMO_SUBJECT = "III"
 """Skin type of the one person in front of flash rig, dome and probe."""
 FLASH_STATES = ("neutral", "anger")
 """Expressions of the face, to which a hemoglobin rig is fitted."""
+FLASH_MOVING_FOLDER = f"appearance-flash-moving-{DEMO_SUBJECT}"
+"""Folder of the blood of the moving face."""
 FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
 """Calibration by target, in the order of computation."""
 FLASH_WANT = (
@@ -59,6 +61,8 @@ PROBE_WANT = (*MEDIUM_WANT, "translucency")
 GRADIENT_SITE = "forehead"
 DOUBLE_FOLDER = "double"
 """Folder of the person's fused maps."""
+FACE_FOLDER = "finished-face"
+"""Folder of the person's face, lit and moving."""
 FUSED_SUBJECTS = {
     "flash": DEMO_SUBJECT,
     "dome": DEMO_SUBJECT,
@@ -175,7 +179,7 @@ def _flash(run: RigDemo) -> None:
                 error = 100 * row.median_relative
                 found.add(name, row.name, error, "%", row.coverage.fraction, row.masked)
     with run.share("flash: fit the blood of a moving face"):
-        moving = run.out / f"appearance-flash-moving-{DEMO_SUBJECT}"
+        moving = run.out / FLASH_MOVING_FOLDER
         calibration = run.out / "calibration-flash"
         fit_facial_color([capture.session], out=moving, calibration=calibration)
         _evaluate_states(moving, found)
@@ -305,6 +309,7 @@ def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
     """Fuse the maps of one person by these rigs, and compare them with the best single rig."""
     from skinrig.evaluating.fusion import compare_fused
     from skinrig.fusing.double import FusionInputs, fuse
+    from skinrig.fusing.finished_face import render_finished_face, write_finished_face
 
     folders = {rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}" for rig in rigs}
     with run.share("fuse the rigs' maps of the person"):
@@ -326,6 +331,38 @@ def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
     )
     named = double.contradiction or "none"
     run.found.add_table("Rig that contradicts the others", ["rig"], [[named]])
+    with run.share("light and move the finished face"):
+        moving = store.read(run.out / FLASH_MOVING_FOLDER)
+        face = render_finished_face(double, moving, expression=FLASH_STATES[1], seed=run.seed)
+        write_finished_face(
+            run.out / FACE_FOLDER,
+            face,
+            double,
+            errors=_list_errors_shown(run.found),
+            person=DOUBLE_FOLDER,
+        )
+
+
+def _list_errors_shown(found: DemoResults) -> dict[str, str]:
+    """Return the errors of what the finished face shows, in words, by quantity."""
+    by_name = {(row[0], row[1]): row[2] for row in found.errors}
+    r_d = [e for (name, what), e in by_name.items() if (name, what[:4]) == (DOUBLE_FOLDER, "r_d ")]
+    shown = {}
+    if r_d:
+        shown["diffuse reflectance"] = f"{min(r_d):.1f} to {max(r_d):.1f} %"
+    for name, what, label, unit in (
+        (f"dome-{DEMO_SUBJECT}", "normals_refined", "normals", "°"),
+        (f"dome-{DEMO_SUBJECT}", "reflection, held out", "reflection in held-out light", " %"),
+        (
+            f"flash-moving-{DEMO_SUBJECT}",
+            f"blood of {FLASH_STATES[1]}, {facial_color.PREDICTION_METHODS[1]}",
+            f"blood volume fraction of {FLASH_STATES[1]}",
+            " %",
+        ),
+    ):
+        if (name, what) in by_name:
+            shown[label] = f"{by_name[name, what]:.1f}{unit}"
+    return shown
 
 
 RIGS: Mapping[str, Callable[[RigDemo], None]] = {

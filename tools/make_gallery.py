@@ -29,7 +29,10 @@ from PIL import Image
 from model import store
 from model.skin import SkinMap
 from skinrig.appearances.front_view import FrontView
+from skinrig.demo_rigs import FACE_FOLDER
 from skinrig.drawing import png
+from skinrig.drawing.frame_sheet import N_LIGHTS, N_STEPS
+from skinrig.fusing.finished_face_file import SHEET_FILE
 from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 from skinrig.viewer import faces, page
 
@@ -46,6 +49,8 @@ FUSED_PANELS = (
     ("translucency", 0.8, 1.2),
 )
 """Maps of the fused person with the ends of their scales; of the mean free path, mm, green."""
+FACE_WIDTH_PX = 160
+"""Width of a frame of the finished face."""
 HIDE_TIME = "document.getElementById('time').style.visibility = 'hidden'"
 """Run times differ between runs: they stay out of the image."""
 
@@ -181,6 +186,20 @@ def fused_person(demo: Path) -> None:
     write("gallery-fused.png", both)
 
 
+def finished_face(demo: Path) -> None:
+    """Draw the fused person under five lights: at rest above, angry below."""
+    sheet = Image.open(demo / FACE_FOLDER / SHEET_FILE).convert("RGB")
+    width, height = sheet.width // N_STEPS, sheet.height // N_LIGHTS
+    small = round(FACE_WIDTH_PX * height / width)
+    image = Image.new("RGB", (N_LIGHTS * FACE_WIDTH_PX, 2 * small))
+    for row, step in enumerate((0, N_STEPS - 1)):
+        for light in range(N_LIGHTS):
+            corner = step * width, light * height
+            frame = sheet.crop((*corner, corner[0] + width, corner[1] + height))
+            image.paste(frame.resize((FACE_WIDTH_PX, small)), (light * FACE_WIDTH_PX, row * small))
+    write("gallery-finished-face.png", image, Image.Dither.FLOYDSTEINBERG)
+
+
 # screenshots -------------------------------------------------------------------------------------
 
 PEOPLE = (("II", 1), ("IV", 2), ("VI", 3))
@@ -250,7 +269,15 @@ def main(demo: Path) -> None:
     """Make all images."""
     began = time.perf_counter()
     IMAGES.mkdir(exist_ok=True)
-    for draw in (chromophores, expression, topography, translucency, held_out, fused_person):
+    for draw in (
+        chromophores,
+        expression,
+        topography,
+        translucency,
+        held_out,
+        fused_person,
+        finished_face,
+    ):
         draw(demo)
     make_reference_images.main()
     make_dome_maps.main(demo)

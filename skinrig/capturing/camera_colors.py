@@ -14,6 +14,8 @@ from skinrig.arrays import Float64Array
 MATRIX_ILLUMINANT: Final = "D65"
 WHITE_D65: Final = np.array([0.95047, 1.0, 1.08883])
 """CIE XYZ of D65, IEC 61966-2-1."""
+SKIN_NODES: Final = 24
+"""Nodes per axis of the skin color table to which `fit_skin_colors` fits."""
 PEAK_SD_NM: Final = 40.0
 """Standard deviation of the peaks of spectra that are not skin; one peak per wavelength."""
 SKIN_WEIGHT, WHITE_WEIGHT = 10.0, 1e4
@@ -35,6 +37,35 @@ def nominal_camera_colors(rig: Rig) -> dict[str, CameraColor]:
         for view in rig.views
         if view.cfa != "MONO" and view.spectral_sensitivity in spectra.camera_names()
     }
+
+
+def fit_skin_colors(camera: str, illuminant: str) -> tuple[Float64Array, float]:
+    """Fit a matrix from camera RGB of skin, relative to white, to linear sRGB under D65.
+
+    Parameters
+    ----------
+    camera, illuminant
+        Names of `model.spectra`.
+
+    Returns
+    -------
+    matrix : ndarray of float64, shape (3, 3)
+        For rows of colors: ``rgb @ matrix``.
+    rms : float
+        Root mean square of the residuals over the skin color table.
+
+    Examples
+    --------
+    >>> matrix, rms = fit_skin_colors("linear sRGB", "D65")
+    >>> bool(np.allclose(matrix, np.eye(3))), rms < 1e-9
+    (True, True)
+    """
+    measured, shown = (
+        color_table.build(*pair, size=SKIN_NODES, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
+        for pair in ((camera, illuminant), (spectra.LINEAR_SRGB, MATRIX_ILLUMINANT))
+    )
+    matrix = np.asarray(np.linalg.lstsq(measured, shown, rcond=None)[0], np.float64)
+    return matrix, float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
 
 
 @lru_cache(maxsize=8)

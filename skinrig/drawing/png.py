@@ -87,9 +87,9 @@ def insert_text(file: bytes, keyword: str, text: str) -> bytes:
     return file[:HEADER_BYTES] + size + chunk + checksum + file[HEADER_BYTES:]
 
 
-def to_data_url(file: bytes) -> str:
-    """Encode a PNG file as a ``data:`` URL."""
-    return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
+def to_data_url(file: bytes, kind: str = "png") -> str:
+    """Encode an image file, of the type image/``kind``, as a ``data:`` URL."""
+    return f"data:image/{kind};base64," + base64.b64encode(file).decode("ascii")
 
 
 def to_webp_url(file: bytes) -> str:
@@ -99,7 +99,7 @@ def to_webp_url(file: bytes) -> str:
     out = io.BytesIO()
     image = Image.open(io.BytesIO(file)).convert("RGB")
     image.save(out, "WEBP", lossless=True, quality=75, method=5)
-    return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+    return to_data_url(out.getvalue(), "webp")
 
 
 def encode_jpeg_url(image: UInt8Array, *, quality: int = 88) -> str:
@@ -108,7 +108,7 @@ def encode_jpeg_url(image: UInt8Array, *, quality: int = 88) -> str:
 
     stored = np.ascontiguousarray(image[..., ::-1])  # OpenCV has blue first
     file = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-    return "data:image/jpeg;base64," + base64.b64encode(file).decode("ascii")
+    return to_data_url(file, "jpeg")
 
 
 def encode_srgb8(linear: FloatArray) -> UInt8Array:

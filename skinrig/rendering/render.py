@@ -132,9 +132,57 @@ def render_surface(
         If lights are missing, the mesh is not visible, or only its back is.
     """
     given = [lights] if isinstance(lights, Light) else lights
-    if not given:
+    return render_light_groups(
+        surface,
+        camera,
+        [given],
+        subsurface=subsurface,
+        subpixels=subpixels,
+        shadow_samples=shadow_samples,
+        blockers=blockers,
+        caster=caster,
+        interior=interior,
+        exchange=exchange,
+        progress=progress,
+    )[0]
+
+
+def render_light_groups(
+    surface: FittedSurface,
+    camera: Camera,
+    groups: Sequence[Sequence[Light]],
+    *,
+    subsurface: Subsurface = "local",
+    subpixels: int = SUBPIXELS_PER_SIDE,
+    shadow_samples: int = SHADOW_SAMPLES,
+    blockers: Mesh | None = None,
+    caster: Caster | None = None,
+    interior: Interior | None = None,
+    exchange: SkinExchange | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Rendering, ...]:
+    """Render one image per group of lights; camera rays are traced once for all of them.
+
+    Parameters
+    ----------
+    groups
+        At least one group of at least one light; the radiance of a group is summed.
+    surface, camera, subsurface, subpixels, shadow_samples, blockers, caster, interior, exchange, \
+progress
+        As for `render_surface`.
+
+    Returns
+    -------
+    tuple of Rendering
+        One per group, in their order.
+
+    Raises
+    ------
+    RenderingError
+        As for `render_surface`.
+    """
+    if not groups or not all(groups):
         raise RenderingError("lights: got none, expected at least one")
-    lamps = [part for light in given for part in light.parts()]
     require_choice("subsurface", subsurface, get_args(Subsurface), RenderingError)
     if shadow_samples < 1:
         raise RenderingError(
@@ -146,11 +194,15 @@ def render_surface(
         if blockers is None
         else Caster(join_meshes(surface.mesh, blockers), choice=rays.choice)
     )
+    shaders = []
+    for group in groups:
+        lamps = [part for light in group for part in light.parts()]
+        lighting = Lighting(lamps, shadows, shadow_samples)
+        returning = None if exchange is None else (exchange, exchange.trace(lighting))
+        inside = _subsurface_radiance(surface, subsurface, lighting, interior, returning)
+        shaders.append(_Shader(surface, lighting, inside, returning))
     columns, height = camera.image_size
-    lighting = Lighting(lamps, shadows, shadow_samples)
-    returning = None if exchange is None else (exchange, exchange.trace(lighting))
-    inside = _subsurface_radiance(surface, subsurface, lighting, interior, returning)
-    film = _PixelAccumulator(height, columns)
+    films = [_PixelAccumulator(height, columns) for _ in groups]
     out = met = 0
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
@@ -162,15 +214,12 @@ def render_surface(
         index = np.flatnonzero(buffers.mask & facing)
         out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
         points = _Points.of(surface, buffers, index)
-        shaded = _shade(points, lighting, surface, inside, returning)
-        film.put(part, subpixels, index, points, shaded)
+        for film, shader in zip(films, shaders, strict=True):
+            film.put(part, subpixels, index, points, shader.shade(points))
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
     _require_outside(out, met - out, camera)
-    whole = film.coverage > 1.0 - 1e-6
-    light = film.diffuse + film.surface, film.diffuse, film.surface
-    masks = film.measured & whole, film.lit & whole
-    return Rendering(*light, film.coverage, *masks, film.uv, subsurface)
+    return tuple(film.develop(subsurface) for film in films)
 
 
 def join_meshes(*meshes: Mesh) -> Mesh:
@@ -270,6 +319,13 @@ class _PixelAccumulator:
         for mask, good in ((self.measured, points.rows.measured), (self.lit, shaded.lit)):
             mask[rows] = (some & (total(good) == count)).reshape(tall, width)
 
+    def develop(self, subsurface: Subsurface) -> Rendering:
+        """Return the image of all bands."""
+        whole = self.coverage > 1.0 - 1e-6
+        light = self.diffuse + self.surface, self.diffuse, self.surface
+        masks = self.measured & whole, self.lit & whole
+        return Rendering(*light, self.coverage, *masks, self.uv, subsurface)
+
 
 Returning = tuple[SkinExchange, ReturningLight] | None
 """Paths between parts of the skin and the light on them; None: direct light only."""
@@ -297,33 +353,36 @@ def _subsurface_radiance(
     )
 
 
-def _shade(
-    points: _Points,
-    lighting: Lighting,
-    fitted_surface: FittedSurface,
-    inside: Callable[[_Points, Float64Array], Float64Array],
-    returning: Returning,
-) -> _Shaded:
-    """Compute the radiance of points towards the camera, summed over lights."""
-    count = len(points.uv)
-    entered, surface = np.zeros((count, 3)), np.zeros((count, 3))
-    lit = np.zeros(count, np.bool_)
-    rows = points.rows
-    cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
-    position, faces, normals = points.position_mm, points.face_normal, rows.normals
-    for lamp in lighting.lamps:
-        through, arriving, towards, seen = lighting.entering_radiance(
-            lamp, position, faces, normals, fitted_surface.model.eta
-        )
-        entered += through
-        lit |= seen >= MIN_LIT_FRACTION
-        shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
-        at = rows.weights[shown], towards[shown], points.view[shown], normals[shown]
-        lobe = lobe_brdf(fitted_surface.model.lobes, *at)
-        surface[shown] += np.pi * lobe[:, None] * arriving[shown]
-    if returning is not None:
-        exchange, from_skin = returning
-        entered += exchange.entered_at(from_skin, position)
-        surface += exchange.reflected_at(from_skin, position, faces, rows, points.view)
-    leaving = transmittance(cos_view, fitted_surface.model.eta)[:, None]
-    return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shader:
+    """Lights on a surface, with the light inside it and between its parts."""
+
+    surface: FittedSurface
+    lighting: Lighting
+    inside: Callable[[_Points, Float64Array], Float64Array]
+    returning: Returning
+
+    def shade(self, points: _Points) -> _Shaded:
+        """Compute the radiance of points towards the camera, summed over lights."""
+        count = len(points.uv)
+        entered, surface = np.zeros((count, 3)), np.zeros((count, 3))
+        lit = np.zeros(count, np.bool_)
+        rows = points.rows
+        cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
+        position, faces, normals = points.position_mm, points.face_normal, rows.normals
+        for lamp in self.lighting.lamps:
+            through, arriving, towards, seen = self.lighting.entering_radiance(
+                lamp, position, faces, normals, self.surface.model.eta
+            )
+            entered += through
+            lit |= seen >= MIN_LIT_FRACTION
+            shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
+            at = rows.weights[shown], towards[shown], points.view[shown], normals[shown]
+            lobe = lobe_brdf(self.surface.model.lobes, *at)
+            surface[shown] += np.pi * lobe[:, None] * arriving[shown]
+        if self.returning is not None:
+            exchange, from_skin = self.returning
+            entered += exchange.entered_at(from_skin, position)
+            surface += exchange.reflected_at(from_skin, position, faces, rows, points.view)
+        leaving = transmittance(cos_view, self.surface.model.eta)[:, None]
+        return _Shaded(leaving * self.inside(points, entered), surface, lit & (cos_view > 0.0))

@@ -10,6 +10,7 @@ from typing import Any
 from capture.calibration.store import SCHEMA as CALIBRATION_SCHEMA
 from model import store
 from model.skin import SkinAppearance
+from skinrig.fusing.finished_face_file import DOCUMENT_FILE as FACE_DOCUMENT
 from skinrig.reporting.sections import images as image_section
 
 
@@ -27,13 +28,16 @@ class ReportInputs:
     sessions: list[Path] = field(default_factory=list)
     pictures: list[Path] = field(default_factory=list)
     """Folders of renderings and analyses."""
+    faces: list[Path] = field(default_factory=list)
+    """Folders of finished faces."""
     documents: list[Path] = field(default_factory=list)
     """JSON documents of commands: benchmarks and the demo's own."""
 
     @property
     def is_empty(self) -> bool:
         """Whether there is nothing to report."""
-        return not (self.appearances or self.sessions or self.documents or self.pictures)
+        shown = (self.appearances, self.sessions, self.documents, self.pictures, self.faces)
+        return not any(shown)
 
     def summary(self) -> str:
         """Return the number of folders of each kind, in a sentence.
@@ -47,6 +51,7 @@ class ReportInputs:
             ("set of maps", "sets of maps", len(self.appearances)),
             ("ground truth", "ground truths", len(self.truths)),
             ("folder of images", "folders of images", len(self.pictures)),
+            ("finished face", "finished faces", len(self.faces)),
             ("calibration", "calibrations", len(self.calibrations)),
             ("session", "sessions", len(self.sessions)),
             ("document", "documents", len(self.documents)),
@@ -62,8 +67,8 @@ class ReportInputs:
     def _describe_source(self) -> str:
         """Return whether people were measured, by the sources that the folders record."""
         sources = []
-        for path in (*self.appearances.values(), *self.sessions):
-            for name in (store.DOCUMENT_FILE, "session.json"):
+        for path in (*self.appearances.values(), *self.sessions, *self.faces):
+            for name in (store.DOCUMENT_FILE, "session.json", FACE_DOCUMENT):
                 with contextlib.suppress(OSError, ValueError, AttributeError):
                     sources.append(json.loads((path / name).read_bytes()).get("source"))
         if not sources:
@@ -111,7 +116,7 @@ def _classify_entry(entry: Path, found: ReportInputs) -> None:
     if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT_FILE:
         if (entry.parent / store.DOCUMENT_FILE).is_file():
             return  # of the appearance itself, which its section shows
-        if entry.name in image_section.DOCUMENT_FILES:
+        if entry.name in (*image_section.DOCUMENT_FILES, FACE_DOCUMENT):
             return  # of a folder of images, which its section shows
         if _is_of_a_calibration(entry):
             return  # the section of its folder lists all of them
@@ -125,6 +130,8 @@ def _classify_entry(entry: Path, found: ReportInputs) -> None:
         (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
     elif (entry / "session.json").is_file():
         found.sessions.append(entry)
+    elif (entry / FACE_DOCUMENT).is_file():
+        found.faces.append(entry)
     elif entry.is_dir() and image_section.folder_document(entry) is not None:
         found.pictures.append(entry)
     elif entry.is_dir() and (

@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from model.skin import SkinAppearance
-from skinrig.drawing import png, templates
+from skinrig.drawing import frame_sheet, png, templates
 from skinrig.reporting import map_names
 from skinrig.unit_format import format_quantity, format_unit
 
@@ -344,7 +344,7 @@ def render_page(
     reload_s
         Seconds after which a browser loads the page again; None: never.
     """
-    style = PAGE_STYLE + _bars()
+    style = PAGE_STYLE + _bars() + frame_sheet.build_style()
     taken = {"content", "contents"}
     head, body = _parts(lead, taken), _parts(sections, taken)
     page = templates.render(

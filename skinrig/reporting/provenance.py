@@ -8,6 +8,7 @@ from typing import Any
 from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
+from skinrig.fusing.finished_face_file import DOCUMENT_FILE as FACE_DOCUMENT
 from skinrig.reporting import page
 from skinrig.reporting.folders import ReportInputs
 from skinrig.reporting.sections import images as image_section
@@ -83,13 +84,12 @@ def read_consent_records(found: ReportInputs) -> Iterator[tuple[Path, dict[str, 
         document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
         if document.get("source") == "measured":
             yield folder, dict(document["subject"])
-    for folder in found.pictures:
-        path = image_section.folder_document(folder)
+    documents = [image_section.folder_document(folder) for folder in found.pictures]
+    for path in (*documents, *(folder / FACE_DOCUMENT for folder in found.faces)):
         if path is not None:
-            for record in (
-                json.loads(path.read_text(encoding="utf-8")).get(consent.CONSENT_KEY) or ()
-            ):
-                yield folder, dict(record)
+            document = json.loads(path.read_text(encoding="utf-8"))
+            for record in document.get(consent.CONSENT_KEY) or ():
+                yield path.parent, dict(record)
 
 
 def consent_section(sides: Sequence[ReportInputs]) -> Iterator[page.Block]:

@@ -23,6 +23,7 @@ from skinrig.reporting.sections import (
     chromophore,
     dynamic,
     extremes,
+    finished_face,
     fused,
     microrelief,
     sequence,
@@ -54,7 +55,11 @@ class Report:
 
 
 def build(
-    paths: Sequence[str | Path], *, title: str = "skinrig report", reload_s: int | None = None
+    paths: Sequence[str | Path],
+    *,
+    title: str = "skinrig report",
+    reload_s: int | None = None,
+    folder: Path | None = None,
 ) -> str:
     """Return a deterministic HTML report of everything at ``paths``.
 
@@ -67,13 +72,15 @@ def build(
         Heading of the page.
     reload_s
         Seconds after which a browser loads the page again; None: never.
+    folder
+        Folder in which the page will be, for links to files there; None: without links.
 
     Raises
     ------
     ReportError
         If a path does not exist, or nothing is found.
     """
-    return build_any(paths, title=title, compare=False, reload_s=reload_s).html
+    return build_any(paths, title=title, compare=False, reload_s=reload_s, folder=folder).html
 
 
 def build_any(
@@ -82,6 +89,7 @@ def build_any(
     title: str = "skinrig report",
     compare: bool | None = None,
     reload_s: int | None = None,
+    folder: Path | None = None,
 ) -> Report:
     """Return the report on a collection, or the comparison of two runs.
 
@@ -95,6 +103,8 @@ def build_any(
         Whether two runs are compared; None: by the rule of `run_comparison.split_sides`.
     reload_s
         As for `build`; a comparison is never loaded again.
+    folder
+        As for `build`.
 
     Raises
     ------
@@ -116,7 +126,7 @@ def build_any(
         return Report(html, checks, (both[0].label, both[1].label), verdicts)
     checks_of_all: list[page.Check] = []
     found = discover(places)
-    body = build_sections(found, checks_of_all)
+    body = build_sections(found, checks_of_all, folder)
     lead = verdict_section.section(
         checks_of_all, found.summary(), _list_least_certain(found), _first_screen(found)
     )
@@ -169,7 +179,9 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
         deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
 
-def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
+def build_sections(
+    found: ReportInputs, checks: list[page.Check], folder: Path | None = None
+) -> list[page.Block]:
     """Return the sections of a report, and add its checks.
 
     Parameters
@@ -178,11 +190,18 @@ def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.B
         Contents of the paths of a report.
     checks
         Checks are added to it.
+    folder
+        Folder in which the page will be; None: unknown.
     """
     appearances = _read_appearances(found)
     sessions = session.read_session_facts(found.sessions)
     return [
         *_maps(found, appearances, checks),
+        *(
+            block
+            for number, face in enumerate(found.faces)
+            for block in finished_face.section(face, number, folder)
+        ),
         *chromophore.draw_identifiability(appearances.values()),
         *subsurface.compare_people(appearances, found.truths),
         *_documents(found, checks),

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
+from fixtures.finished_faces import gray_frames, write_face
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from skinrig.drawing.frame_sheet import FRAME_PX, PERIOD_S
 from skinrig.reporting import report
 from skinrig.reporting.page import Image, Images, render_page
 from skinrig.reporting.status import build_status_page, read_status
@@ -323,4 +325,96 @@ def test_skip_link_and_contents_lead_to_targets(browser, pages):
     )
     assert len(targets) >= 3
     assert all(targets)
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def face_page(tmp_path_factory):
+    """Return the address of a report on a finished face."""
+    folder = tmp_path_factory.mktemp("face")
+    write_face(folder / "finished-face")
+    path = folder / "report.html"
+    path.write_text(report.build([folder], folder=folder), encoding="utf-8")
+    return path
+
+
+def shown_level(page):
+    """Return the gray level in the middle of the frame that is shown."""
+    picture = page.locator(".player .frame").screenshot()
+    image = np.asarray(PIL.Image.open(io.BytesIO(picture)).convert("L"), float)
+    height, width = image.shape
+    return image[height // 4 : -height // 4, width // 4 : -width // 4].mean()
+
+
+def seek(page, seconds):
+    """Stop the movement at a time after its start."""
+    page.evaluate(
+        "t => document.getAnimations().forEach(a => { a.pause(); a.currentTime = t })",
+        1e3 * seconds,
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scripts", [True, False])
+def test_light_buttons_choose_the_row(browser, face_page, scripts):
+    """The keyboard moves along the radio buttons, as along a slider."""
+    levels = gray_frames()[:, 0, 0, 0, 0]
+    still = {"reduced_motion": "reduce", "java_script_enabled": scripts}
+    context, page, problems = opened(browser, face_page, **still)
+    assert shown_level(page) == pytest.approx(levels[1], abs=3)
+    page.get_by_role("radio", name="half left", exact=True).focus()
+    for expected in levels[2:]:
+        page.keyboard.press("ArrowRight")
+        assert shown_level(page) == pytest.approx(expected, abs=3)
+    page.get_by_text("left", exact=True).click()
+    assert shown_level(page) == pytest.approx(levels[0], abs=3)
+    assert problems == []
+    context.close()
+
+
+@pytest.mark.long
+def test_movement_shows_every_step_and_pauses(browser, face_page):
+    levels = gray_frames()[1, :, 0, 0, 0]
+    context, page, problems = opened(browser, face_page)
+    states = "document.getAnimations().map(a => a.playState)"
+    assert page.evaluate(states) == ["running"]
+    page.get_by_role("checkbox", name="Pause the movement to anger").check()
+    assert page.evaluate(states) == ["paused"]
+    found = []
+    for step in range(len(levels)):
+        seek(page, PERIOD_S * (0.15 + 0.7 * (step + 0.5) / len(levels)))
+        found.append(shown_level(page))
+    np.testing.assert_allclose(found, levels, atol=3)
+    assert problems == []
+    context.close()
+
+
+@pytest.mark.long
+def test_reduced_motion_rests_until_play(browser, face_page):
+    context, page, _ = opened(browser, face_page, reduced_motion="reduce")
+    states = "document.getAnimations().map(a => a.playState)"
+    assert page.evaluate(states) == ["paused"]
+    page.get_by_role("checkbox", name="Play the movement to anger").check()
+    assert page.evaluate(states) == ["running"]
+    context.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1280)])
+def test_finished_face_fits_and_passes_axe(browser, face_page, axe, scheme, width):
+    context, page, problems = opened(
+        browser, face_page, scheme=scheme, width=width, bypass_csp=True
+    )
+    findings, passes = serious(page, axe)
+    assert findings == []
+    assert passes > 10
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    frame = page.locator(".player .frame").bounding_box()
+    assert frame["width"] / frame["height"] == pytest.approx(FRAME_PX[0] / FRAME_PX[1], rel=0.01)
+    assert frame["x"] + frame["width"] <= width
+    targets = page.locator(".player input").evaluate_all(
+        "all => all.map(one => one.getBoundingClientRect().height)"
+    )
+    assert min(targets) >= 24.0
+    assert problems == []
     context.close()

@@ -16,6 +16,8 @@ from skinrig.demo import RIGS, DemoError, run_demo
 from skinrig.simulating.orders import SimulationError
 from skinrig.viewer.faces import build_scene
 
+MAX_REPORT_BYTES = 3_000_000
+
 
 @pytest.fixture
 def without_benchmarks(monkeypatch):
@@ -65,7 +67,7 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
         monkeypatch.setitem(RIGS, rig, lambda *_, made=made: made.mkdir())
     built = []
 
-    def build(paths, *, title, reload_s):
+    def build(paths, *, title, reload_s, folder):
         built.append(([path.name for path in paths], title, reload_s))
         return f"report {len(built)}"
 
@@ -106,6 +108,12 @@ def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, wit
     assert len(Session.open(out / "session-dome-III").rig.views) == 4
     report = (out / "report.html").read_text(encoding="utf-8")
     assert "Traceback" not in report
+    assert len(report.encode()) <= MAX_REPORT_BYTES
+    # the finished face is the last chapter of the maps, with a sheet of its own
+    last = report.index('<h2 id="the-finished-face">')
+    assert last > report.rindex('<h2 id="maps-')
+    assert report[last:].index("data:image/webp") < report[last:].index("</section>")
+    assert "blood volume fraction of anger" in report[last:]
     errors = {(subject, name): error for subject, name, error, *_ in document["errors"]}
     # a pixel is 3.3 mm on the face: coarser than what a full dome is held to
     assert errors["dome-III", "normals"] < 4.0

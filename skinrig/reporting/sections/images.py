@@ -106,7 +106,7 @@ def _images(folder: Path) -> Iterator[page.Block]:
             kept.append(path.name)
             continue
         title = path.stem.replace("-", " ")
-        figures.append(page.Image(title, png.to_data_url(data), title))
+        figures.append(page.Image(title, png.to_webp_url(data), title))
     yield page.Images(figures)
     if kept:
         yield page.build_note(f"Too large for this report: {', '.join(kept)}.")

@@ -71,7 +71,7 @@ def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
     yield page.build_table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
         [(name, *one.cells) for name, one in sessions.items()],
-        caption="Frames on disk; `skinrig verify` checks each of them",
+        caption="Frames on disk; skinrig verify checks each of them",
     )
 
 

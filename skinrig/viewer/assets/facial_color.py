@@ -21,6 +21,7 @@ from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import hash_file as sha256_of
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import Float64Array
+from skinrig.capturing.camera_colors import fit_skin_colors
 from skinrig.viewer.assets.placed_color import (
     RIG_PX,
     FaceColor,
@@ -34,8 +35,6 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 COLOR_KIND: Final = "color"
 CALIBRATION_INPUT_PREFIX: Final = "calibration "
 """Prefix of an appearance's inputs that are files of a calibration."""
-MATRIX_NODES: Final = 24
-"""Nodes per axis of the skin color table to which a matrix is fitted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +123,7 @@ def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | No
     camera, light = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
     if camera not in spectra.camera_names() or light not in spectra.illuminant_names():
         return None
-    measured, shown = (
-        color_table.build(*pair, size=MATRIX_NODES, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
-        for pair in ((camera, light), (spectra.LINEAR_SRGB, "D65"))
-    )
-    matrix = np.linalg.lstsq(measured, shown, rcond=None)[0]
-    error = float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
+    matrix, error = fit_skin_colors(camera, light)
     return CameraColor(
         lambda rgb: np.asarray(rgb @ matrix),
         f"without color calibration; matrix for skin colors from the tabulated sensor "

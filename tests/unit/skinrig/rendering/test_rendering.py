@@ -22,6 +22,7 @@ from skinrig.rendering.geometry import (
 )
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
+from skinrig.rendering.render import render_light_groups
 from skinrig.rendering.render import render_surface as render_laid
 
 FRONT = (0.0, 0.0, 700.0)
@@ -122,6 +123,25 @@ def test_patch_irradiance_follows_cosine_and_transmittance(matt):
     cosine = np.cos(1.0)
     expected = transmittance(cosine) * transmittance(1.0) * cosine * np.array([1.2, 0.4, 0.1])
     np.testing.assert_allclose(middle(seen.radiance), expected, rtol=1e-4)
+
+
+def test_light_groups_equal_their_own_renderings(shiny):
+    mesh = dome_mesh()
+    surface = FittedSurface.of(model_on(mesh, shiny), mesh)
+    left = Light(name="left", direction=(-1.0, 0.3, 1.0), radius=0.03)
+    right = Light(name="right", direction=(1.0, 0.0, 0.5))
+    groups = [[left], [right], [left, right]]
+    found = render_light_groups(surface, front_camera(), groups)
+    for group, one in zip(groups, found, strict=True):
+        alone = render_laid(surface, front_camera(), group)
+        for name in ("diffuse", "surface", "coverage", "covered", "lit", "uv"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(alone, name))
+    assert np.abs(found[0].surface - found[1].surface).max() > 0.01
+    both = found[0].radiance + found[1].radiance
+    np.testing.assert_allclose(found[2].radiance, both, rtol=1e-5, atol=1e-6)
+    for groups in ([], [[left], []]):
+        with pytest.raises(RenderingError, match="at least one"):
+            render_light_groups(surface, front_camera(), groups)
 
 
 def test_point_light_falls_with_squared_distance(matt):

@@ -50,7 +50,7 @@ def test_comparison_adds_limit_and_names_omissions(tmp_path):
     assert "no surface" in body
     assert "light held out" in body
     assert "lights as drawn" in body
-    assert body.count("data:image/png") == 1
+    assert body.count("data:image/webp") == 1
 
 
 def test_report_finds_images_below_its_folder(tmp_path):

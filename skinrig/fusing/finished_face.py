@@ -1,0 +1,268 @@
+"""Render a fused person's face under several lights, from rest to an expression.
+
+Color, normals, reflection and blood are measured. The movement of the mesh is the simulator's:
+no rig measures it in the demo.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from model import color_table, spectra
+from model.facial_color.state_maps import NEUTRAL
+from model.skin import SkinAppearance
+from model.skin_reflectance import SkinReflectance, assemble
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX
+from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.subject import expressions
+from skinrig import consent
+from skinrig.applying.expression import read_hemoglobin_rig
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt8Array
+from skinrig.atomic_file import replace_folder_atomically
+from skinrig.capturing.camera_colors import fit_skin_colors
+from skinrig.console import to_json_value
+from skinrig.drawing.frame_sheet import FRAME_PX, N_LIGHTS, N_STEPS, encode_sheet
+from skinrig.errors import require_choice
+from skinrig.fusing.double import FusedDouble
+from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SCHEMA, SHEET_FILE
+from skinrig.fusing.sources import FusionInputError
+from skinrig.rendering.camera import Camera, look_at
+from skinrig.rendering.folder import apply_tone_curve, choose_exposure
+from skinrig.rendering.geometry import FittedSurface, read_own_mesh
+from skinrig.rendering.hole_patches import close_holes
+from skinrig.rendering.lights import Light
+from skinrig.rendering.render import Rendering, render_light_groups
+from skinrig.viewer.map_filling import fill_holes
+
+LIGHT_AZIMUTHS_DEG: Final = {
+    "left": -75.0,
+    "half left": -40.0,
+    "front": 0.0,
+    "half right": 40.0,
+    "right": 75.0,
+}
+"""Azimuth of each light, degrees, positive to the right of the image."""
+LIGHT_ELEVATION_DEG: Final = 25.0
+LIGHT_RADIUS_RAD: Final = 0.035
+"""Angular radius of a light; its shadows have soft borders."""
+SHADOW_SAMPLES: Final = 2
+FILL_WEIGHT: Final = 0.3
+"""Weight of the mean over all lights, which fills the shadows."""
+CAMERA_MM: Final = (0.0, 0.0, 700.0)
+TARGET_MM: Final = (0.0, 8.0, 0.0)
+FIELD_OF_VIEW_DEG: Final = 15.6
+"""Of the longer side: 192 mm at the origin of the rig, from the crown to the neck."""
+BACKGROUND_CODES: Final = np.array([40.0, 42.0, 45.0])
+"""8-bit sRGB."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedFace:
+    """Frames of a face and their description.
+
+    Attributes
+    ----------
+    frames : ndarray of uint8, shape (L, S, H, W, 3)
+        sRGB, by light and step.
+    expression
+        State at the last step.
+    weights
+        Weight of the expression at each step.
+    blood_fraction
+        Fraction of the texels with a measured change of blood; the rest has it from around.
+    left_out
+        Omissions with reasons.
+    """
+
+    frames: UInt8Array
+    expression: str
+    weights: tuple[float, ...]
+    blood_fraction: float
+    left_out: tuple[tuple[str, str], ...]
+
+
+def render_finished_face(
+    double: FusedDouble, moving: SkinAppearance, *, expression: str, seed: int
+) -> FinishedFace:
+    """Render a fused person in `N_LIGHTS` directions of light and `N_STEPS` steps.
+
+    Parameters
+    ----------
+    double
+        Person fused from a dome and a flash rig.
+    moving
+        Hemoglobin rig in the flash rig's image, of the same pose as the fused maps.
+    expression
+        One of its states, which is also an expression of `rigsim.subject.expressions`.
+    seed
+        Seed of the movement, which is simulated.
+
+    Raises
+    ------
+    FusionInputError
+        If the person lacks a dome or a flash rig, or the expression is unknown.
+    """
+    model = assemble(double.appearance)
+    closed = close_holes(read_own_mesh(double.appearance))
+    shapes = expressions.blend_shapes(closed.mesh, seed=seed)
+    require_choice("expression", expression, tuple(shapes), FusionInputError)
+    skin = _MovingColor.of(double, model, moving, expression)
+    weights = np.linspace(0.0, 1.0, N_STEPS)
+    steps = [
+        _render_step(skin.at(float(w)), closed.mesh, np.float32(w) * shapes[expression])
+        for w in weights
+    ]
+    left_out = (
+        *closed.summary(),
+        ("movement of this face", "no rig measures it here; the blend shapes are simulated"),
+        ("eyes, hair and fine wrinkles", "the fused maps have none"),
+    )
+    return FinishedFace(
+        _develop(steps), expression, tuple(weights.tolist()), skin.known_fraction, left_out
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _MovingColor:
+    """Reflectance of the skin, linear sRGB, by the weight of an expression."""
+
+    model: SkinReflectance
+    """Fitted model with R_d in linear sRGB, at rest."""
+    melanin: Float64Array
+    """Volume fraction of the chosen texels, shape (n,)."""
+    blood: Float64Array
+    """Volume fraction at rest, shape (n,)."""
+    change: Float64Array
+    """Its measured change to the full expression, shape (n,)."""
+    texels: BoolArray
+    """(H, W): texels with chromophores."""
+    known_fraction: float
+    table: color_table.ColorTable
+
+    @staticmethod
+    def of(
+        double: FusedDouble, model: SkinReflectance, moving: SkinAppearance, expression: str
+    ) -> "_MovingColor":
+        """Place the measured change of blood on the texels of the fused maps."""
+        placement, maps = double.measured.placement, double.appearance.maps
+        bands = next((one.bands for one in double.measured.colors if one.bands.rig == "dome"), None)
+        if placement is None or bands is None:
+            raise FusionInputError("finished face: got a person without dome and flash rig")
+        rig = read_hemoglobin_rig(moving)
+        require_choice("expression", expression, tuple(rig.states), FusionInputError)
+        rest, full = (rig.evaluate({name: 1.0}) for name in (NEUTRAL, expression))
+        both = rest.valid & full.valid
+        change, known = placement.sample(full.hemoglobin - rest.hemoglobin, both)
+        melanin, blood = maps["melanin"], maps["hemoglobin"]
+        good = melanin.mask & blood.mask
+        rgb, _ = fit_skin_colors(bands.camera, bands.illuminant)
+        shown = np.clip(np.asarray(model.r_d, np.float64) @ rgb, 0.0, 1.0)
+        return _MovingColor(
+            dataclasses.replace(model, r_d=shown.astype(np.float32)),
+            melanin.values[good].astype(np.float64),
+            blood.values[good].astype(np.float64),
+            fill_holes(change, known)[good],
+            good,
+            float((known & good).sum() / max(good.sum(), 1)),
+            color_table.build(spectra.LINEAR_SRGB, "D65", size=24, anisotropy=ANISOTROPY_SKIN),
+        )
+
+    def at(self, weight: float) -> SkinReflectance:
+        """Return the model with the blood of a weight; its ratio of colors acts on R_d."""
+        moved = np.clip(self.blood + weight * self.change, 0.0, C_HD_MAX)
+        ratio = self.table.lookup(self.melanin, moved)
+        ratio = ratio / self.table.lookup(self.melanin, self.blood)
+        r_d = np.array(self.model.r_d)
+        r_d[self.texels] *= ratio.astype(np.float32)
+        return dataclasses.replace(self.model, r_d=r_d)
+
+
+def aim_camera(size_px: tuple[int, int]) -> Camera:
+    """Return the camera in front of a face in a dome's frame; `size_px` is width and height."""
+    return look_at(
+        CAMERA_MM, target_mm=TARGET_MM, fov_deg=FIELD_OF_VIEW_DEG, size_px=size_px, name="front"
+    )
+
+
+def build_lights(azimuths_deg: Mapping[str, float]) -> tuple[Light, ...]:
+    """Return distant lights at one elevation, by name and azimuth, degrees, positive to the right.
+
+    Examples
+    --------
+    >>> right, = build_lights({"right": 90.0})
+    >>> [round(x, 2) for x in right.direction]
+    [0.91, 0.42, 0.0]
+    """
+    elevation = np.radians(LIGHT_ELEVATION_DEG)
+    across, up = float(np.cos(elevation)), float(np.sin(elevation))
+    lights = []
+    for name, azimuth_deg in azimuths_deg.items():
+        turn = np.radians(azimuth_deg)
+        towards = float(np.sin(turn)) * across, up, float(np.cos(turn)) * across
+        lights.append(Light(name=name, direction=towards, radius=LIGHT_RADIUS_RAD))
+    return tuple(lights)
+
+
+def _render_step(
+    model: SkinReflectance, rest: Mesh, moved_mm: Float32Array
+) -> tuple[Rendering, ...]:
+    """Render a moved face, one image per light."""
+    mesh = build_mesh(rest.vertices_mm + moved_mm, rest.faces, rest.uv)
+    surface = FittedSurface.of(model, mesh, rest=rest)
+    lights = [[light] for light in build_lights(LIGHT_AZIMUTHS_DEG)]
+    return render_light_groups(
+        surface, aim_camera(FRAME_PX), lights, subpixels=1, shadow_samples=SHADOW_SAMPLES
+    )
+
+
+def _develop(steps: list[tuple[Rendering, ...]]) -> UInt8Array:
+    """Return display images, (L, S, H, W, 3), of one exposure, with filled shadows."""
+    radiance = np.stack([[one.radiance for one in step] for step in steps], axis=1)
+    radiance = radiance + FILL_WEIGHT * radiance.mean(axis=0)
+    coverage = np.stack([step[0].coverage for step in steps])[..., None]
+    front = list(LIGHT_AZIMUTHS_DEG).index("front")
+    exposure = choose_exposure(radiance[front, 0], coverage[0, ..., 0])
+    skin = apply_tone_curve(radiance / np.maximum(coverage, 1e-3), exposure)
+    mixed = skin * coverage + BACKGROUND_CODES * (1.0 - coverage)
+    return np.rint(mixed).astype(np.uint8).reshape(N_LIGHTS, N_STEPS, *FRAME_PX[::-1], 3)
+
+
+def write_finished_face(
+    out: Path, face: FinishedFace, double: FusedDouble, *, errors: dict[str, str], person: str
+) -> None:
+    """Write the frames and their record into a folder, which is replaced.
+
+    Parameters
+    ----------
+    out
+        The folder.
+    face
+        Frames of the person.
+    double
+        The person.
+    errors
+        Errors of what is shown, in words, by quantity.
+    person
+        Name of the folder of the person's maps, next to `out`.
+    """
+    document = {
+        "schema": SCHEMA,
+        "person": person,
+        "expression": face.expression,
+        "weights": face.weights,
+        "lights": LIGHT_AZIMUTHS_DEG,
+        "blood_fraction": face.blood_fraction,
+        "errors": errors,
+        "left_out": face.left_out,
+        "source": double.appearance.source,
+        consent.CONSENT_KEY: consent.merge_consent(double.appearance),
+    }
+    with replace_folder_atomically(out) as fresh:
+        (fresh / SHEET_FILE).write_bytes(encode_sheet(face.frames))
+        text = json.dumps(to_json_value(document), indent=1, allow_nan=False)
+        (fresh / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
