@@ -15,11 +15,13 @@ from capture.devices.port import SYSTEM_CLOCK, Clock, DeviceError
 from capture.plan import Plan, Step, Value
 from capture.raw import CameraColor
 from capture.rig import Rig
-from capture.session import Session
+from capture.session import NewFrame, Session
 
 log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3
+MAX_GROUP_BYTES = 2**26
+"""Largest size of encoded frames that wait to be written together, but for the last one."""
 
 
 class AcquisitionError(DeviceError, RuntimeError):
@@ -167,7 +169,7 @@ class CaptureRun:
         t_box_s: float | None,
         journal_entries: Mapping[str, Value],
     ) -> None:
-        """Commit the frames of a step, one per camera.
+        """Commit the frames of a step, one per camera, together.
 
         Parameters
         ----------
@@ -182,23 +184,33 @@ class CaptureRun:
         noted
             Further journal entries of the frames.
         """
+        group: list[NewFrame] = []
         for name, frame in frames.items():
-            # a step of which only some cameras were kept is repeated with all of them
-            attempt = self._attempts.get((step.id, name), 0) + 1
             shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
-            self.session.commit(
-                step.id,
-                name,
-                self.encode_frame(step, name, frame, light),
-                settings=dict(step.settings),
-                actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
-                t_box_s=t_box_s,
-                t_host_s=self.operator.clock(),
-                attempt=attempt,
+            group.append(
+                NewFrame(
+                    camera=name,
+                    blob=self.encode_frame(step, name, frame, light),
+                    settings=step.settings,
+                    actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
+                    t_box_s=t_box_s,
+                    t_host_s=self.operator.clock(),
+                    # a step of which only some cameras were kept is repeated with all of them
+                    attempt=self._attempts.get((step.id, name), 0) + 1,
+                )
             )
-            self._attempts[step.id, name] = attempt
-            self.frames += 1
+            if sum(len(one.blob) for one in group) >= MAX_GROUP_BYTES:
+                self._commit(step, group)
+                group = []
+        if group:
+            self._commit(step, group)
         self.steps += 1
+
+    def _commit(self, step: Step, group: Sequence[NewFrame]) -> None:
+        self.session.commit_step(step.id, group)
+        for one in group:
+            self._attempts[step.id, one.camera] = one.attempt
+        self.frames += len(group)
 
     def note_retake(self, step: Step, attempt: int, reason: object) -> str:
         """Record that a step must be repeated; return the reason."""

@@ -11,6 +11,7 @@ from capture.session.errors import (
 )
 from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, SubjectRecord
+from capture.session.new_frame import NewFrame
 from capture.session.reopening import reopen_copy, resume_unless_complete
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify
@@ -25,6 +26,7 @@ __all__ = [
     "FrameLine",
     "FrameRecord",
     "Manifest",
+    "NewFrame",
     "NotASession",
     "Session",
     "SessionDamage",

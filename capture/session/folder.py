@@ -2,6 +2,7 @@
 
 import logging
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -59,6 +60,15 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.fsync(descriptor)
     finally:
         disk.close(descriptor)
+
+
+def write_group(disk: Disk, files: Mapping[Path, bytes]) -> None:
+    """Write new files of one folder, several at once, and flush their data, then their names."""
+    parts = {path.with_name(f"{path.name}.part"): blob for path, blob in files.items()}
+    disk.for_each(lambda part: write_new(disk, part, parts[part]), list(parts))
+    for part, path in zip(parts, files, strict=True):
+        disk.rename(part, path)
+    disk.fsync_dir(path.parent)
 
 
 def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
@@ -181,7 +191,7 @@ def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
     lines = {line.file: line for line in contents.file_lines}
     present = list_files(path)
     orphans = unlisted_files(path, contents)
-    if (lost := find_lost_lines(path, orphans)) is not None:
+    if (lost := find_lost_lines(path, contents, orphans)) is not None:
         raise lost
     for line in lines.values():
         size = (path / line.file).lstat().st_size if line.file in present else None

@@ -205,8 +205,16 @@ def seal_bounded_line(previous: str, line: Line) -> tuple[bytes, str]:
     return text, head
 
 
-def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
-    """Follow the chain from ``seal`` to the last line, a truncated line, or the first damage."""
+def walk_journal(data: bytes, *, seal: str, where: str, max_group: int = 1) -> JournalWalk:
+    """Follow the chain from ``seal`` to the last line, truncated lines, or the first damage.
+
+    Parameters
+    ----------
+    data, seal, where
+        The journal, the seal of its manifest, and its name for messages.
+    max_group
+        Largest number of lines written at once.
+    """
     lines: list[tuple[int, Line]] = []
     head, start = seal, 0
     while start < len(data):
@@ -220,7 +228,8 @@ def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
         try:
             line, digest = _unseal(text, head, f"{where}, byte {start}")
         except SessionDamage as exc:
-            if _is_torn(text, stop < 0, last=start + len(text) == len(data), head=head):
+            left = data.count(b"\n", start) + (not data.endswith(b"\n"))
+            if _is_torn(text, unended=stop < 0, last=left <= max_group, head=head):
                 return JournalWalk(tuple(lines), head, start, len(data) - start, None)
             return JournalWalk(tuple(lines), head, start, 0, exc)
         if line is None:  # complete but for its newline: was never acknowledged
@@ -260,12 +269,23 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
     )
 
 
-def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
+def _is_torn(text: bytes, *, unended: bool, last: bool, head: str) -> bool:
     """Return whether a bad line looks like the truncated end of an interrupted write.
 
-    An interrupted write leaves a prefix of the line, zeros, or a prefix and zeros. A flipped bit
-    leaves at most one zero byte, and a line whose newline was hit is one byte longer than a whole
-    record: these are damage to an acknowledged line.
+    An interrupted write leaves a prefix of its lines, zeros, a prefix and zeros, or a hole of zeros
+    before further lines. A flipped bit leaves at most one zero byte, and a line whose newline was
+    hit is one byte longer than a whole record: these are damage to an acknowledged line.
+
+    Parameters
+    ----------
+    text
+        The bad line.
+    unended
+        Whether its newline is missing.
+    last
+        Whether it and all after it may be of one write.
+    head
+        Hash of the line before.
     """
     if not last:
         return False

@@ -23,7 +23,7 @@ from capture.session.contents import (
 )
 from capture.session.disk import Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
-from capture.session.folder import DiskErrors, make_folder, move_orphans, write_new
+from capture.session.folder import DiskErrors, make_folder, move_orphans, write_group
 from capture.session.journal import (
     ATTACHMENT_RULE,
     AttachmentLine,
@@ -31,7 +31,6 @@ from capture.session.journal import (
     FrameLine,
     OmissionLine,
     attachment_path,
-    frame_path,
     is_attachment_name,
     seal_bounded_line,
 )
@@ -42,6 +41,7 @@ from capture.session.manifest import (
     calibration_refs,
     package_versions,
 )
+from capture.session.new_frame import NewFrame
 from capture.session.view import MAX_FRAME_BYTES, SessionView, check_blob
 
 _log = logging.getLogger(__name__)
@@ -204,58 +204,55 @@ class Session(SessionView):
                 raise
         return cls(place, contents, disk=disk, descriptor=descriptor)
 
-    def commit(
-        self,
-        step_id: str,
-        camera: str,
-        blob: bytes,
-        *,
-        settings: Mapping[str, Value],
-        actual: Mapping[str, Value],
-        t_box_s: float | None = None,
-        t_host_s: float,
-        attempt: int = 1,
-    ) -> None:
+    def commit(self, step_id: str, camera: str, blob: bytes, **about: Any) -> None:
         """Write one frame to the medium; when this returns, it survives a power cut.
 
         Parameters
         ----------
-        step_id, camera : str
-            Step of the plan and one of its cameras.
-        blob : bytes
-            A DNG of ours that names the same step and this session.
-        settings, actual : mapping
-            Requested settings, and those that controller and camera report.
-        t_box_s : float or None
-            Time of the exposure on the controller's clock, s.
-        t_host_s : float
-            Time of arrival on the host's clock, s.
-        attempt : int
-            1, or one more than the last attempt for a frame taken again.
+        step_id : str
+            Step of the plan.
+        camera, blob, **about
+            See `NewFrame`.
+
+        Raises
+        ------
+        SessionError, SessionDiskError
+            See `commit_step`.
+        """
+        self.commit_step(step_id, [NewFrame(camera=camera, blob=blob, **about)])
+
+    def commit_step(self, step_id: str, frames: Sequence[NewFrame]) -> None:
+        """Write frames of a step to the medium; when this returns, they survive a power cut.
+
+        Their files are flushed several at once, then their names together, then their lines. After
+        an interruption all frames count, or the first ones, or none.
+
+        Parameters
+        ----------
+        step_id : str
+            Step of the plan.
+        frames : sequence of NewFrame
+            At least one, each of another camera.
 
         Raises
         ------
         SessionError
-            When the frame does not fit the plan; nothing is written.
+            When a frame does not fit the plan; nothing is written.
         SessionDiskError
             When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
-        self._check_commit(step_id, camera, blob, attempt)
-        line = FrameLine(
-            step=step_id,
-            camera=camera,
-            attempt=attempt,
-            file=frame_path(step_id, camera, attempt),
-            bytes=len(blob),
-            xxh128=xxhash.xxh3_128_hexdigest(blob),
-            settings=dict(settings),
-            actual=dict(actual),
-            t_box_s=None if t_box_s is None else float(t_box_s),
-            t_host_s=float(t_host_s),
-        )
-        self._write(descriptor, line, blob)
-        self._lines.setdefault((step_id, camera), []).append(line)
+        cameras = [frame.camera for frame in frames]
+        checks = FaultCollector("Frames of a step", SessionError)
+        differ = len(set(cameras)) == len(cameras) > 0
+        checks.check("cameras", cameras, differ, "at least one, none twice")
+        checks.close()
+        for frame in frames:
+            self._check_commit(step_id, frame)
+        files = [(frame.line(step_id), frame.blob) for frame in frames]
+        self._write(descriptor, files)
+        for line, _ in files:
+            self._lines.setdefault((step_id, line.camera), []).append(line)
 
     def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
         """Attach a file other than a frame; when this returns, it survives a power cut.
@@ -295,7 +292,7 @@ class Session(SessionView):
             xxh128=xxhash.xxh3_128_hexdigest(data),
             about=dict(about or {}),
         )
-        self._write(descriptor, line, bytes(data))
+        self._write(descriptor, [(line, bytes(data))])
         self._attached[name] = line
 
     def omit_steps(
@@ -349,19 +346,20 @@ class Session(SessionView):
             self._append(descriptor, text)
         self._left_out.update(dict.fromkeys(line.steps, line))
 
-    def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
-        """Write a file and then its line of the journal to the medium."""
-        text, head = seal_bounded_line(self._head, line)
-        target = self.path / line.file
-        part = target.with_name(target.name + ".part")
+    def _write(
+        self, descriptor: int, files: Sequence[tuple[FrameLine | AttachmentLine, bytes]]
+    ) -> None:
+        """Write files of one folder, and then their lines of the journal, to the medium."""
+        text, head = b"", self._head
+        for line, _ in files:
+            sealed, head = seal_bounded_line(head, line)
+            text += sealed
         with self._acknowledging(head):
-            if isinstance(line, AttachmentLine) and not self._attached:
-                if not target.parent.is_dir():
+            if isinstance(files[0][0], AttachmentLine) and not self._attached:
+                if not (self.path / ATTACHMENTS_FOLDER).is_dir():
                     self._disk.make_dir(self.path / ATTACHMENTS_FOLDER)
                 self._disk.fsync_dir(self.path)
-            write_new(self._disk, part, blob)
-            self._disk.rename(part, target)
-            self._disk.fsync_dir(target.parent)
+            write_group(self._disk, {self.path / line.file: blob for line, blob in files})
             self._append(descriptor, text)
 
     @contextmanager
@@ -428,8 +426,8 @@ class Session(SessionView):
             raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
         return self._descriptor
 
-    def _check_commit(self, step_id: str, camera: str, blob: bytes, attempt: int) -> None:
-        step = self.plan.step(step_id)
+    def _check_commit(self, step_id: str, frame: NewFrame) -> None:
+        step, camera = self.plan.step(step_id), frame.camera
         if camera not in step.cameras:
             faults = [Fault("camera", short_repr(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
@@ -438,12 +436,12 @@ class Session(SessionView):
             raise SessionError("the step was omitted", where=str(self.path), faults=faults)
         done = self._lines.get((step_id, camera), [])
         expected = done[-1].attempt + 1 if done else 1
-        if attempt < 1 or (done and attempt != expected):
-            faults = [Fault("attempt", str(attempt), f"{expected}")]
+        if frame.attempt < 1 or (done and frame.attempt != expected):
+            faults = [Fault("attempt", str(frame.attempt), f"{expected}")]
             advice = "A committed frame is never replaced; take it with the next attempt number."
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
-        check_blob(blob, step_id, self.id)
+        check_blob(frame.blob, step_id, self.id)
 
     def _append(self, descriptor: int, text: bytes) -> None:
         self._disk.write(descriptor, text)

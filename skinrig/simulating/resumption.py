@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -191,14 +191,19 @@ class ReplayedSession(Session):
         super().close(missing_reason=missing_reason)
         self.exposures.remove()
 
-    def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
-        text, head = seal_bounded_line(self._head, line)
-        if self._replay(text):
+    def _write(
+        self, descriptor: int, files: Sequence[tuple[FrameLine | AttachmentLine, bytes]]
+    ) -> None:
+        fresh = list(files)
+        while fresh and self._recorded:  # an interruption may have recorded the first lines alone
+            text, head = seal_bounded_line(self._head, fresh.pop(0)[0])
+            self._replay(text)
             self._head = head
-        else:
-            super()._write(descriptor, line, blob)
-        if isinstance(line, FrameLine) or "camera" in line.about:
-            self.exposures.note_commit(line.file, blob)
+        if fresh:
+            super()._write(descriptor, fresh)
+        for line, blob in files:
+            if isinstance(line, FrameLine) or "camera" in line.about:
+                self.exposures.note_commit(line.file, blob)
 
     def _append(self, descriptor: int, text: bytes) -> None:
         # lines of frames and attachments were compared before their files were written

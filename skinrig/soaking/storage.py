@@ -7,13 +7,13 @@ name that was not synced in its folder is there or not.
 import errno
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from capture.session.disk import Disk
+from capture.session.disk import Disk, ItemT
 from skinrig.soaking.host_life import HostLife
 
 DATA_FATES: Final[Mapping[str, Callable[[bytes], bytes]]] = {
@@ -71,6 +71,11 @@ class LoggedDisk(Disk):
     def name(self, path: Path) -> str:
         """Return a path relative to the root."""
         return os.path.relpath(path, self.root)
+
+    def for_each(self, work: Callable[[ItemT], object], items: Sequence[ItemT]) -> None:
+        """Do work for one item after the other, so that each run has the same log."""
+        for item in items:
+            work(item)
 
     def make_dir(self, path: Path) -> None:
         """Make a directory; see `Disk`, as for all operations."""
