@@ -34,14 +34,14 @@ ASKED = {
 def commit_only(monkeypatch, count):
     """Have the session fail before the commit after `count` ones."""
     commits = itertools.count()
-    keep = Session.commit
+    keep = Session.commit_step
 
     def commit(self, *args, **more):
         if next(commits) == count:  # None: never
             raise Enough
         return keep(self, *args, **more)
 
-    monkeypatch.setattr(Session, "commit", commit)
+    monkeypatch.setattr(Session, "commit_step", commit)
 
 
 def read_files(folder):

@@ -1,0 +1,48 @@
+"""Frames of a step are written together, as far as memory is bounded."""
+
+from types import SimpleNamespace
+
+import pytest
+from fixtures.small_sessions import CAMERAS, DOME, create_session, plan_of
+
+from capture.acquire import outcome
+from capture.acquire.outcome import CaptureRun, Operator
+from capture.devices.camera import Exposure, Frame
+
+FRAME_BYTES = 1000
+
+
+@pytest.fixture
+def groups(monkeypatch):
+    """Cameras and attempts of each group that was committed."""
+    seen = []
+    blob = bytes(FRAME_BYTES)
+    monkeypatch.setattr(outcome, "encode_step_frame", lambda *_: blob)
+
+    def commit_step(_, step_id, frames):
+        seen.append((step_id, [(one.camera, one.attempt) for one in frames]))
+
+    monkeypatch.setattr(outcome.Session, "commit_step", commit_step)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("limit", "sizes"),
+    [(3 * FRAME_BYTES + 1, [3]), (3 * FRAME_BYTES, [3]), (FRAME_BYTES + 1, [2, 1]), (1, [1] * 3)],
+)
+def test_frames_wait_together_up_to_limit(tmp_path, monkeypatch, groups, limit, sizes):
+    """Without the limit, all encoded frames of a step are in memory at once."""
+    monkeypatch.setattr(outcome, "MAX_GROUP_BYTES", limit)
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        cameras = dict.fromkeys(CAMERAS, SimpleNamespace())
+        run = CaptureRun(plan, DOME, cameras, session, Operator(clock=lambda: 7.0))
+        frames = {name: Frame("1", 0, 0.0, 0.1, Exposure(0.1, 100), b"") for name in CAMERAS}
+        for attempt in (1, 2):
+            groups.clear()
+            words = {"light": {}, "tries": 1, "t_box_s": None, "journal_entries": {}}
+            run.commit_frames(plan.steps[0], frames, **words)
+            assert [len(group) for _, group in groups] == sizes
+            committed = [one for _, group in groups for one in group]
+            assert committed == [(camera, attempt) for camera in CAMERAS]
+        assert (run.steps, run.frames) == (2, 2 * len(CAMERAS))
