@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3
 MAX_GROUP_BYTES = 2**26
-"""Largest size of encoded frames that wait to be written together, but for the last one."""
+"""Largest size of frames that are encoded and written together, but for a single one."""
 
 
 class AcquisitionError(DeviceError, RuntimeError):
@@ -184,33 +184,30 @@ class CaptureRun:
         noted
             Further journal entries of the frames.
         """
-        group: list[NewFrame] = []
-        for name, frame in frames.items():
-            shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
-            group.append(
-                NewFrame(
-                    camera=name,
-                    blob=self.encode_frame(step, name, frame, light),
-                    settings=step.settings,
-                    actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
-                    t_box_s=t_box_s,
-                    t_host_s=self.operator.clock(),
-                    # a step of which only some cameras were kept is repeated with all of them
-                    attempt=self._attempts.get((step.id, name), 0) + 1,
-                )
-            )
-            if sum(len(one.blob) for one in group) >= MAX_GROUP_BYTES:
-                self._commit(step, group)
-                group = []
-        if group:
-            self._commit(step, group)
-        self.steps += 1
+        # a step of which only some cameras were kept is repeated with all of them
+        attempts = {name: self._attempts.get((step.id, name), 0) + 1 for name in frames}
 
-    def _commit(self, step: Step, group: Sequence[NewFrame]) -> None:
-        self.session.commit_step(step.id, group)
-        for one in group:
-            self._attempts[step.id, one.camera] = one.attempt
-        self.frames += len(group)
+        def encode(name: str) -> NewFrame:
+            frame = frames[name]
+            shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
+            return NewFrame(
+                camera=name,
+                blob=self.encode_frame(step, name, frame, light),
+                settings=step.settings,
+                actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
+                t_box_s=t_box_s,
+                t_host_s=self.operator.clock(),
+                attempt=attempts[name],
+            )
+
+        images = [frame.image for frame in frames.values()]
+        largest = max(len(one) if isinstance(one, bytes) else one.nbytes for one in images)
+        names, count = list(frames), max(1, MAX_GROUP_BYTES // largest)
+        for group in (names[k : k + count] for k in range(0, len(names), count)):
+            self.session.commit_step(step.id, map(encode, group))
+            self._attempts.update({(step.id, name): attempts[name] for name in group})
+            self.frames += len(group)
+        self.steps += 1
 
     def note_retake(self, step: Step, attempt: int, reason: object) -> str:
         """Record that a step must be repeated; return the reason."""

@@ -124,7 +124,7 @@ def encode_dng(
 
 def encode_frame(frame: RawFrame) -> bytes:
     """Encode a frame unchanged as a DNG; see `encode_dng`."""
-    pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").tobytes()
+    pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").data.cast("B")
     small = draw_thumbnail(frame)
     xmp = _xmp(frame, pixels)
 
@@ -145,7 +145,8 @@ def encode_frame(frame: RawFrame) -> bytes:
     pixels_at = -(-(small_at + preview) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
     parts = lay_out(8 + main, small_at, pixels_at)
     head = struct.pack("<2sHI", b"II", 42, 8) + parts[0] + parts[1]
-    return (head.ljust(small_at, b"\0") + parts[2]).ljust(pixels_at, b"\0") + pixels
+    head = (head.ljust(small_at, b"\0") + parts[2]).ljust(pixels_at, b"\0")
+    return b"".join((head, pixels))  # the only copy of the pixels
 
 
 def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
@@ -327,7 +328,7 @@ def _exif_entries(frame: RawFrame) -> list[Entry]:
     return entries
 
 
-def _xmp(frame: RawFrame, pixels: bytes) -> bytes:
+def _xmp(frame: RawFrame, pixels: memoryview) -> bytes:
     words = {
         "step": frame.step_id,
         "session": frame.session_id,

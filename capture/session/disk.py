@@ -6,7 +6,7 @@ Reading needs no such care: it is one function.
 import fcntl
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, TypeVar
@@ -70,15 +70,12 @@ class Disk:
         """Remove a file's name."""
         os.unlink(path)
 
-    def for_each(self, work: Callable[[ItemT], object], items: Sequence[ItemT]) -> None:
-        """Do work for each item, several at once; after an error, no further item is begun.
+    def for_each(self, work: Callable[[ItemT], object], items: Iterable[ItemT]) -> None:
+        """Do work for each item on threads, while this one makes the next items.
 
-        It returns, or raises the first item's error, once no work is left. A model of the disk
-        does one after the other.
+        After an error, no further item is begun. It returns, or raises the first error, once no
+        work is left. A model of the disk does one after the other.
         """
-        if len(items) == 1:
-            work(items[0])
-            return
         with ThreadPoolExecutor(N_WRITERS) as pool:
             for _ in pool.map(work, items):
                 pass

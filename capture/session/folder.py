@@ -2,13 +2,15 @@
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
 from capture.session.consent_seal import KEY_VARIABLE, SEAL_FILE, make_seal, read_key
 from capture.session.contents import (
+    ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
     JOURNAL_FILE,
     MANIFEST_FILE,
@@ -62,13 +64,31 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.close(descriptor)
 
 
-def write_group(disk: Disk, files: Mapping[Path, bytes]) -> None:
-    """Write new files of one folder, several at once, and flush their data, then their names."""
-    parts = {path.with_name(f"{path.name}.part"): blob for path, blob in files.items()}
-    disk.for_each(lambda part: write_new(disk, part, parts[part]), list(parts))
-    for part, path in zip(parts, files, strict=True):
+def write_group(disk: Disk, files: Iterable[tuple[Path, bytes]]) -> None:
+    """Write new files of one folder, several at once, and flush their data, then their names.
+
+    Files are written while further ones are made. After an error, no file of the group is left
+    unless the disk refuses that, too.
+    """
+    parts: dict[Path, Path] = {}
+
+    def name_parts() -> Iterator[tuple[Path, bytes]]:
+        for path, blob in files:
+            part = path.with_name(f"{path.name}.part")
+            parts[part] = path
+            yield part, blob
+
+    try:
+        disk.for_each(lambda file: write_new(disk, *file), name_parts())
+    except BaseException:
+        for part in parts:
+            with suppress(OSError):  # the first error is the cause
+                disk.remove(part)
+        raise
+    for part, path in parts.items():
         disk.rename(part, path)
-    disk.fsync_dir(path.parent)
+    for folder in {path.parent for path in parts.values()}:
+        disk.fsync_dir(folder)
 
 
 def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
@@ -88,6 +108,13 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
         if not (path / JOURNAL_FILE).exists():
             write_new(disk, path / JOURNAL_FILE, b"")
         write_manifest(disk, path, manifest)
+
+
+def make_attachments_folder(disk: Disk, path: Path) -> None:
+    """Make the folder of attachments, also where an interruption left its name unflushed."""
+    if not (path / ATTACHMENTS_FOLDER).is_dir():
+        disk.make_dir(path / ATTACHMENTS_FOLDER)
+    disk.fsync_dir(path)
 
 
 def write_consent_seal(disk: Disk, path: Path, manifest: bytes) -> None:

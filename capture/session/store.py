@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,15 +15,16 @@ import xxhash
 from capture.documents import Fault, FaultCollector, short_repr
 from capture.plan import Plan, Value
 from capture.rig import Rig
-from capture.session.contents import (
-    ATTACHMENTS_FOLDER,
-    JOURNAL_FILE,
-    SessionContents,
-    read_undamaged_contents,
-)
+from capture.session.contents import JOURNAL_FILE, SessionContents, read_undamaged_contents
 from capture.session.disk import Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
-from capture.session.folder import DiskErrors, make_folder, move_orphans, write_group
+from capture.session.folder import (
+    DiskErrors,
+    make_attachments_folder,
+    make_folder,
+    move_orphans,
+    write_group,
+)
 from capture.session.journal import (
     ATTACHMENT_RULE,
     AttachmentLine,
@@ -205,53 +206,41 @@ class Session(SessionView):
         return cls(place, contents, disk=disk, descriptor=descriptor)
 
     def commit(self, step_id: str, camera: str, blob: bytes, **about: Any) -> None:
-        """Write one frame to the medium; when this returns, it survives a power cut.
-
-        Parameters
-        ----------
-        step_id : str
-            Step of the plan.
-        camera, blob, **about
-            See `NewFrame`.
-
-        Raises
-        ------
-        SessionError, SessionDiskError
-            See `commit_step`.
-        """
+        """Write one frame to the medium, as `commit_step`; ``about`` are fields of `NewFrame`."""
         self.commit_step(step_id, [NewFrame(camera=camera, blob=blob, **about)])
 
-    def commit_step(self, step_id: str, frames: Sequence[NewFrame]) -> None:
+    def commit_step(self, step_id: str, frames: Iterable[NewFrame]) -> None:
         """Write frames of a step to the medium; when this returns, they survive a power cut.
 
         Their files are flushed several at once, then their names together, then their lines. After
-        an interruption all frames count, or the first ones, or none.
+        an interruption all frames count, or the first ones, or none. A generator of frames makes
+        the next ones while others are written.
 
         Parameters
         ----------
         step_id : str
             Step of the plan.
-        frames : sequence of NewFrame
-            At least one, each of another camera.
+        frames : iterable of NewFrame
+            Each of another camera.
 
         Raises
         ------
         SessionError
-            When a frame does not fit the plan; nothing is written.
+            When a frame does not fit the plan; nothing is left of the group.
         SessionDiskError
             When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
-        cameras = [frame.camera for frame in frames]
-        checks = FaultCollector("Frames of a step", SessionError)
-        differ = len(set(cameras)) == len(cameras) > 0
-        checks.check("cameras", cameras, differ, "at least one, none twice")
-        checks.close()
-        for frame in frames:
-            self._check_commit(step_id, frame)
-        files = [(frame.line(step_id), frame.blob) for frame in frames]
-        self._write(descriptor, files)
-        for line, _ in files:
+        lines: dict[str, FrameLine] = {}
+
+        def check() -> Iterator[tuple[FrameLine, bytes]]:
+            for frame in frames:
+                self._check_commit(step_id, frame, others=lines)
+                lines[frame.camera] = frame.line(step_id)
+                yield lines[frame.camera], frame.blob
+
+        self._write(descriptor, check())
+        for line in lines.values():
             self._lines.setdefault((step_id, line.camera), []).append(line)
 
     def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
@@ -292,6 +281,9 @@ class Session(SessionView):
             xxh128=xxhash.xxh3_128_hexdigest(data),
             about=dict(about or {}),
         )
+        if not self._attached:
+            with self._released_on_failure():
+                make_attachments_folder(self._disk, self.path)
         self._write(descriptor, [(line, bytes(data))])
         self._attached[name] = line
 
@@ -342,29 +334,33 @@ class Session(SessionView):
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
         )
         text, head = seal_bounded_line(self._head, line)
-        with self._acknowledging(head):
+        with self._released_on_failure():
             self._append(descriptor, text)
+        self._head = head
         self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(
-        self, descriptor: int, files: Sequence[tuple[FrameLine | AttachmentLine, bytes]]
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, bytes]]
     ) -> None:
         """Write files of one folder, and then their lines of the journal, to the medium."""
         text, head = b"", self._head
-        for line, _ in files:
-            sealed, head = seal_bounded_line(head, line)
-            text += sealed
-        with self._acknowledging(head):
-            if isinstance(files[0][0], AttachmentLine) and not self._attached:
-                if not (self.path / ATTACHMENTS_FOLDER).is_dir():
-                    self._disk.make_dir(self.path / ATTACHMENTS_FOLDER)
-                self._disk.fsync_dir(self.path)
-            write_group(self._disk, {self.path / line.file: blob for line, blob in files})
-            self._append(descriptor, text)
+
+        def seal() -> Iterator[tuple[Path, bytes]]:
+            nonlocal text, head
+            for line, blob in files:
+                sealed, head = seal_bounded_line(head, line)
+                text += sealed
+                yield self.path / line.file, blob
+
+        with self._released_on_failure():
+            write_group(self._disk, seal())
+            if text:
+                self._append(descriptor, text)
+        self._head = head
 
     @contextmanager
-    def _acknowledging(self, head: str) -> Iterator[None]:
-        """Advance to a head after its line is written; release the session on failure."""
+    def _released_on_failure(self) -> Iterator[None]:
+        """Release the session when the disk refuses."""
         try:
             with DiskErrors(self.path):
                 yield
@@ -372,7 +368,6 @@ class Session(SessionView):
             # how much reached the medium is unknown: only resume() can find out
             self.release()
             raise
-        self._head = head
 
     def close(self, *, missing_reason: str = "") -> None:
         """Close the session for good: nothing can be added afterwards.
@@ -426,11 +421,14 @@ class Session(SessionView):
             raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
         return self._descriptor
 
-    def _check_commit(self, step_id: str, frame: NewFrame) -> None:
+    def _check_commit(self, step_id: str, frame: NewFrame, others: Container[str]) -> None:
         step, camera = self.plan.step(step_id), frame.camera
         if camera not in step.cameras:
             faults = [Fault("camera", short_repr(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
+        if camera in others:
+            faults = [Fault("camera", short_repr(camera), "one frame of each camera")]
+            raise SessionError(f"step {step_id!r} has two frames of a camera", faults=faults)
         if step_id in self._left_out:
             faults = [Fault("step", short_repr(step_id), "one that was not omitted")]
             raise SessionError("the step was omitted", where=str(self.path), faults=faults)

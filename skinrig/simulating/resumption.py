@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -192,16 +192,23 @@ class ReplayedSession(Session):
         self.exposures.remove()
 
     def _write(
-        self, descriptor: int, files: Sequence[tuple[FrameLine | AttachmentLine, bytes]]
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, bytes]]
     ) -> None:
-        fresh = list(files)
-        while fresh and self._recorded:  # an interruption may have recorded the first lines alone
-            text, head = seal_bounded_line(self._head, fresh.pop(0)[0])
+        written: list[tuple[FrameLine | AttachmentLine, bytes]] = []
+
+        def note() -> Iterator[tuple[FrameLine | AttachmentLine, bytes]]:
+            for file in files:
+                written.append(file)
+                yield file
+
+        fresh = note()
+        while self._recorded and (file := next(fresh, None)) is not None:
+            # an interruption may have recorded the first lines alone
+            text, head = seal_bounded_line(self._head, file[0])
             self._replay(text)
             self._head = head
-        if fresh:
-            super()._write(descriptor, fresh)
-        for line, blob in files:
+        super()._write(descriptor, fresh)
+        for line, blob in written:
             if isinstance(line, FrameLine) or "camera" in line.about:
                 self.exposures.note_commit(line.file, blob)
 

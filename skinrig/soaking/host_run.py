@@ -1,6 +1,6 @@
 """Run one host against a simulated rig: open, capture or resume, end; with at most one fault."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -66,10 +66,11 @@ class WitnessedSession(Session):
 
     ledger: Ledger
 
-    def commit_step(self, step_id: str, frames: Sequence[NewFrame]) -> None:
+    def commit_step(self, step_id: str, frames: Iterable[NewFrame]) -> None:
         """Commit frames of a step; see `Session.commit_step`."""
-        super().commit_step(step_id, frames)
-        for frame in frames:
+        committed = list(frames)
+        super().commit_step(step_id, committed)
+        for frame in committed:
             key = (step_id, frame.camera, frame.attempt)
             self.ledger.frames[key] = xxhash.xxh3_128_hexdigest(frame.blob)
 

@@ -7,7 +7,7 @@ name that was not synced in its folder is there or not.
 import errno
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -72,7 +72,7 @@ class LoggedDisk(Disk):
         """Return a path relative to the root."""
         return os.path.relpath(path, self.root)
 
-    def for_each(self, work: Callable[[ItemT], object], items: Sequence[ItemT]) -> None:
+    def for_each(self, work: Callable[[ItemT], object], items: Iterable[ItemT]) -> None:
         """Do work for one item after the other, so that each run has the same log."""
         for item in items:
             work(item)

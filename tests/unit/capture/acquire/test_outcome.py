@@ -10,14 +10,14 @@ from capture.acquire.outcome import CaptureRun, Operator
 from capture.devices.camera import Exposure, Frame
 
 FRAME_BYTES = 1000
+IMAGE = bytes(FRAME_BYTES)
 
 
 @pytest.fixture
 def groups(monkeypatch):
     """Cameras and attempts of each group that was committed."""
     seen = []
-    blob = bytes(FRAME_BYTES)
-    monkeypatch.setattr(outcome, "encode_step_frame", lambda *_: blob)
+    monkeypatch.setattr(outcome, "encode_step_frame", lambda *_: IMAGE)
 
     def commit_step(_, step_id, frames):
         seen.append((step_id, [(one.camera, one.attempt) for one in frames]))
@@ -28,7 +28,7 @@ def groups(monkeypatch):
 
 @pytest.mark.parametrize(
     ("limit", "sizes"),
-    [(3 * FRAME_BYTES + 1, [3]), (3 * FRAME_BYTES, [3]), (FRAME_BYTES + 1, [2, 1]), (1, [1] * 3)],
+    [(3 * FRAME_BYTES, [3]), (3 * FRAME_BYTES - 1, [2, 1]), (FRAME_BYTES, [1] * 3), (1, [1] * 3)],
 )
 def test_frames_wait_together_up_to_limit(tmp_path, monkeypatch, groups, limit, sizes):
     """Without the limit, all encoded frames of a step are in memory at once."""
@@ -37,7 +37,7 @@ def test_frames_wait_together_up_to_limit(tmp_path, monkeypatch, groups, limit, 
     with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
         cameras = dict.fromkeys(CAMERAS, SimpleNamespace())
         run = CaptureRun(plan, DOME, cameras, session, Operator(clock=lambda: 7.0))
-        frames = {name: Frame("1", 0, 0.0, 0.1, Exposure(0.1, 100), b"") for name in CAMERAS}
+        frames = {name: Frame("1", 0, 0.0, 0.1, Exposure(0.1, 100), IMAGE) for name in CAMERAS}
         for attempt in (1, 2):
             groups.clear()
             words = {"light": {}, "tries": 1, "t_box_s": None, "journal_entries": {}}

@@ -4,6 +4,7 @@ import errno
 import logging
 import math
 import os
+import time
 from datetime import UTC, datetime
 
 import numpy as np
@@ -109,17 +110,53 @@ def test_frames_of_step_are_committed_in_order(tmp_path):
     assert (report.ok, report.frames) == (True, 2 * len(CAMERAS))
 
 
-@pytest.mark.parametrize("cameras", [(), ("C00", "C00")])
-def test_step_without_or_with_repeated_camera_is_refused(tmp_path, cameras):
+def test_refused_frame_of_step_leaves_no_file_of_others(tmp_path):
+    """Frames before it may be on the disk already, as each is written while the next is made."""
     plan = plan_of(1, len(CAMERAS))
     with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
         words = {"settings": {}, "actual": {}, "t_host_s": 0.0}
         blob = encode_frame(session, "S000")
-        frames = [NewFrame(camera=camera, blob=blob, **words) for camera in cameras]
-        with pytest.raises(SessionError, match="expected at least one, none twice"):
-            session.commit_step("S000", frames)
+        first, other, foreign = (
+            NewFrame(camera=camera, blob=blob, **words) for camera in ("C00", "C01", "C09")
+        )
+
+        def fail():
+            yield first
+            yield other
+            raise ZeroDivisionError("lost")
+
+        for frames, error, text in [
+            ([first, other, first], SessionError, "got 'C00', expected one frame of each camera"),
+            ([first, other, foreign], SessionError, "no such camera"),
+            (fail(), ZeroDivisionError, "lost"),
+        ]:
+            with pytest.raises(error, match=text):
+                session.commit_step("S000", frames)
+            assert journal_of(session) == b""
+            assert list((session.path / "frames").iterdir()) == []
+        session.commit_step("S000", [])
         assert journal_of(session) == b""
-        assert list((session.path / "frames").iterdir()) == []
+        commit_step(session, "S000")
+        session.close()
+    assert verify(tmp_path / "s").ok
+
+
+def test_frames_are_written_while_next_ones_are_made(tmp_path):
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+
+        def make():
+            for camera in CAMERAS:
+                blob = encode_frame(session, "S000")
+                yield NewFrame(camera=camera, blob=blob, settings={}, actual={}, t_host_s=0.0)
+                deadline_s = time.monotonic() + 10.0
+                part = session.path / f"frames/S000+{camera}.dng.part"
+                while not part.exists() or part.stat().st_size < len(blob):
+                    assert time.monotonic() < deadline_s
+                    time.sleep(0.001)
+
+        session.commit_step("S000", make())
+        assert len(session.frames()) == len(CAMERAS)
 
 
 class DiskFullAt(Disk):
@@ -153,7 +190,7 @@ def test_full_disk_within_step_loses_no_committed_frame(tmp_path, camera):
     with pytest.raises(SessionError, match="not open for writing"):
         commit_step(session, "S002")
     assert {r.step_id for r in Session.open(session.path).frames()} == {"S000"}
-    assert [path.suffix for path in (session.path / "frames").glob("S001*")].count(".dng") == 0
+    assert list((session.path / "frames").glob("S001*")) == []
     with Session.resume(session.path) as again:
         for step in ("S001", "S002"):
             commit_step(again, step)

@@ -104,6 +104,21 @@ def test_resumed_session_has_bytes_of_uninterrupted_session(
 
 
 @pytest.mark.long
+def test_partly_recorded_step_resumes_same_bytes(tmp_path, monkeypatch, whole_files):
+    """A power cut may leave the lines of a step's first cameras alone."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1795000000")
+    with monkeypatch.context() as patch:
+        commit_only(patch, 3)
+        with pytest.raises(Enough):
+            simulate_session("dome", tmp_path / "parts", **ASKED["dome"])
+    journal = tmp_path / "parts/journal.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-1])
+    assert len(Session.open(tmp_path / "parts").frames()) == 3 * ASKED["dome"]["views"] - 1
+    simulate_session("dome", tmp_path / "parts", resume=True, **ASKED["dome"])
+    assert read_files(tmp_path / "parts") == whole_files("dome")
+
+
+@pytest.mark.long
 def test_session_of_another_journal_is_not_resumed(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         commit_only(patch, 3)
