@@ -2,9 +2,10 @@
 
     python tools/measure_disk.py FOLDER
 
-FOLDER is on the disk; 0.8 GB are written there per round, and removed. Each round writes one file,
-and the frames of two sessions as a capture does it, encoding included: steps of 16 cameras, and
-steps of one. It then reads the first session; the page cache is dropped before each reading.
+FOLDER is on the disk; 1 GB are written there per round, and removed. Each round writes one file,
+the frames of two sessions as a capture does it, encoding included, and a second file in between:
+steps of 16 cameras, then steps of one. It then reads the first session; the page cache is dropped
+before each reading.
 """
 
 import argparse
@@ -29,6 +30,8 @@ from capture.session.verification import verify
 
 FRAMES = 96
 BLOCK_BYTES = 1 << 22
+FILE_BLOCKS = 62
+"""About the size of the frames."""
 SUBJECT = SubjectRecord("P1", ("research",))
 
 
@@ -98,16 +101,17 @@ def write_session(path: Path, n_cameras: int) -> tuple[float, float]:
 
 def measure(folder: Path) -> tuple[float, float, float, float, float]:
     """Return MB/s of a file's and two sessions' writing, and of files' reading and verification."""
+    file_mb = FILE_BLOCKS * BLOCK_BYTES * 1e-6
+    before_s = time_s(lambda: write_file(folder / "before", FILE_BLOCKS))
     size_mb, several = write_session(folder / "session", 16)
-    count = round(size_mb * 1e6 / BLOCK_BYTES)
-    file_mb = count * BLOCK_BYTES * 1e-6
-    file_s = time_s(lambda: write_file(folder / "file", count))
+    after_s = time_s(lambda: write_file(folder / "after", FILE_BLOCKS))
     _, one = write_session(folder / "one", 1)
     drop_cache(folder / "session")
     read_s = time_s(lambda: read_files(folder / "session"))
     drop_cache(folder / "session")
     verify_s = time_s(lambda: verify(folder / "session"))
-    return file_mb / file_s, several, one, size_mb / read_s, size_mb / verify_s
+    file_rate = 2.0 * file_mb / (before_s + after_s)
+    return file_rate, several, one, size_mb / read_s, size_mb / verify_s
 
 
 def main() -> None:

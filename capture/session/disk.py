@@ -17,8 +17,8 @@ from capture.session.errors import SessionDamage, SessionError
 _E = TypeVar("_E", bound=SessionError)
 ItemT = TypeVar("ItemT")
 
-N_WRITERS: Final = 4
-"""Files written at the same time: while one is flushed, others are copied to the disk's queue."""
+N_WRITERS: Final = 16
+"""Files written at the same time: the dome's step, whose flushes the file system joins."""
 
 
 class Disk:
