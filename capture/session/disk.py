@@ -9,13 +9,15 @@ import stat
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 from capture.documents import Fault
 from capture.session.errors import SessionDamage, SessionError
 
 _E = TypeVar("_E", bound=SessionError)
 ItemT = TypeVar("ItemT")
+Blob: TypeAlias = bytes | memoryview
+"""Bytes of a file."""
 
 N_WRITERS: Final = 16
 """Files written at the same time: the dome's step, whose flushes the file system joins."""
@@ -44,7 +46,7 @@ class Disk:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
         return os.open(path, flags, 0o600)
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write all of ``data``, in one system call unless the kernel takes less."""
         rest = memoryview(data)
         while rest:

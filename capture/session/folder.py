@@ -22,7 +22,7 @@ from capture.session.contents import (
     read_contents,
     unlisted_files,
 )
-from capture.session.disk import Disk, read_file
+from capture.session.disk import Blob, Disk, read_file
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
 _log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ class DiskErrors:
             raise SessionDiskError(what, where=where, advice=self._advice, code=code) from value
 
 
-def write_new(disk: Disk, path: Path, data: bytes) -> None:
+def write_new(disk: Disk, path: Path, data: Blob) -> None:
     """Write a new file and flush its data; the caller flushes its name."""
     descriptor = disk.create(path)
     try:
@@ -64,7 +64,7 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.close(descriptor)
 
 
-def write_group(disk: Disk, files: Iterable[tuple[Path, bytes]]) -> None:
+def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
     """Write new files of one folder, several at once, and flush their data, then their names.
 
     Files are written while further ones are made. After an error, no file of the group is left
@@ -72,7 +72,7 @@ def write_group(disk: Disk, files: Iterable[tuple[Path, bytes]]) -> None:
     """
     parts: dict[Path, Path] = {}
 
-    def name_parts() -> Iterator[tuple[Path, bytes]]:
+    def name_parts() -> Iterator[tuple[Path, Blob]]:
         for path, blob in files:
             part = path.with_name(f"{path.name}.part")
             parts[part] = path

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import xxhash
 
 from capture.plan import Value
+from capture.session.disk import Blob
 from capture.session.journal import FrameLine, frame_path
 
 
@@ -15,7 +16,7 @@ class NewFrame:
 
     camera: str
     """One of the step's cameras."""
-    blob: bytes
+    blob: Blob
     """A DNG of ours that names the step and the session."""
     settings: Mapping[str, Value]
     """Requested settings."""

@@ -16,7 +16,7 @@ from capture.documents import Fault, FaultCollector, short_repr
 from capture.plan import Plan, Value
 from capture.rig import Rig
 from capture.session.contents import JOURNAL_FILE, SessionContents, read_undamaged_contents
-from capture.session.disk import Disk
+from capture.session.disk import Blob, Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
 from capture.session.folder import (
     DiskErrors,
@@ -205,7 +205,7 @@ class Session(SessionView):
                 raise
         return cls(place, contents, disk=disk, descriptor=descriptor)
 
-    def commit(self, step_id: str, camera: str, blob: bytes, **about: Any) -> None:
+    def commit(self, step_id: str, camera: str, blob: Blob, **about: Any) -> None:
         """Write one frame to the medium, as `commit_step`; ``about`` are fields of `NewFrame`."""
         self.commit_step(step_id, [NewFrame(camera=camera, blob=blob, **about)])
 
@@ -233,7 +233,7 @@ class Session(SessionView):
         descriptor = self._writable()
         lines: dict[str, FrameLine] = {}
 
-        def check() -> Iterator[tuple[FrameLine, bytes]]:
+        def check() -> Iterator[tuple[FrameLine, Blob]]:
             for frame in frames:
                 self._check_commit(step_id, frame, others=lines)
                 lines[frame.camera] = frame.line(step_id)
@@ -340,12 +340,12 @@ class Session(SessionView):
         self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(
-        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, bytes]]
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
     ) -> None:
         """Write files of one folder, and then their lines of the journal, to the medium."""
         text, head = b"", self._head
 
-        def seal() -> Iterator[tuple[Path, bytes]]:
+        def seal() -> Iterator[tuple[Path, Blob]]:
             nonlocal text, head
             for line, blob in files:
                 sealed, head = seal_bounded_line(head, line)

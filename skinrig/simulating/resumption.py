@@ -29,7 +29,7 @@ from capture.session.contents import (
     ORPHANS_FOLDER,
     SessionContents,
 )
-from capture.session.disk import Disk, read_file
+from capture.session.disk import Blob, Disk, read_file
 from capture.session.journal import AttachmentLine, FrameLine, seal_bounded_line
 from capture.session.manifest import decode
 from capture.session.view import check_file
@@ -114,7 +114,7 @@ class ExposureStore:
         part.rename(path)
         self._keys[digest] = key
 
-    def note_commit(self, file: str, blob: bytes) -> None:
+    def note_commit(self, file: str, blob: Blob) -> None:
         """Record the file of a committed image, and remove the image from the store."""
         key = self._keys.pop(_digest(raw.decode(memoryview(blob), where=file).cfa), None)
         if key is None:
@@ -192,11 +192,11 @@ class ReplayedSession(Session):
         self.exposures.remove()
 
     def _write(
-        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, bytes]]
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
     ) -> None:
-        written: list[tuple[FrameLine | AttachmentLine, bytes]] = []
+        written: list[tuple[FrameLine | AttachmentLine, Blob]] = []
 
-        def note() -> Iterator[tuple[FrameLine | AttachmentLine, bytes]]:
+        def note() -> Iterator[tuple[FrameLine | AttachmentLine, Blob]]:
             for file in files:
                 written.append(file)
                 yield file

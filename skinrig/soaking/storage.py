@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from capture.session.disk import Disk, ItemT
+from capture.session.disk import Blob, Disk, ItemT
 from skinrig.soaking.host_life import HostLife
 
 DATA_FATES: Final[Mapping[str, Callable[[bytes], bytes]]] = {
@@ -99,7 +99,7 @@ class LoggedDisk(Disk):
         self.opened[descriptor] = (self.name(path), self.known[number])
         return descriptor
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write data."""
         super().write(descriptor, data)
         self.note("write", self.opened[descriptor][1], bytes(data))
@@ -238,7 +238,7 @@ class FaultyDisk(LoggedDisk):
         """Open a file for appending."""
         return int(self._run("open_append", super().open_append, path))
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write data."""
         self._run("write", super().write, descriptor, data)
 
