@@ -9,9 +9,8 @@ from capture.session.errors import (
     SessionError,
     SessionLocked,
 )
-from capture.session.journal import AttachmentLine, FrameLine
+from capture.session.journal import AttachmentLine, FrameLine, NewFrame
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, SubjectRecord
-from capture.session.new_frame import NewFrame
 from capture.session.reopening import reopen_copy, resume_unless_complete
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify

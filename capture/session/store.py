@@ -30,6 +30,7 @@ from capture.session.journal import (
     AttachmentLine,
     CloseLine,
     FrameLine,
+    NewFrame,
     OmissionLine,
     attachment_path,
     is_attachment_name,
@@ -42,7 +43,6 @@ from capture.session.manifest import (
     calibration_refs,
     package_versions,
 )
-from capture.session.new_frame import NewFrame
 from capture.session.view import MAX_FRAME_BYTES, SessionView, check_blob
 
 _log = logging.getLogger(__name__)

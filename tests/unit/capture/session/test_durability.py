@@ -87,7 +87,7 @@ def test_frame_is_durable_before_its_line(tmp_path, disk):
         ]
 
 
-def test_frames_of_step_share_flushes_of_names_and_lines(tmp_path, disk):
+def test_frames_of_step_share_flushes(tmp_path, disk):
     plan = plan_of(1, len(CAMERAS))
     files = [f"s/frames/S000+{camera}.dng" for camera in CAMERAS]
     with create_session(tmp_path / "s", disk=disk, plan=plan, rig=DOME) as session:

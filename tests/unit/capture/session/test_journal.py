@@ -158,7 +158,7 @@ def test_zeros_after_last_line_are_torn(tail):
 
 @pytest.mark.parametrize("kept", [0, 1, 2])
 @pytest.mark.parametrize("lost", ["hole", "end", "zeros"])
-def test_lines_of_one_write_are_torn_from_any_byte(kept, lost):
+def test_lines_of_one_write_are_torn(kept, lost):
     """The lines before are whole, and their files are durable: they count."""
     texts = seal_lines(*(OMITTED,) * 4)
     start = sum(map(len, texts[: 1 + kept]))

@@ -110,7 +110,7 @@ def test_frames_of_step_are_committed_in_order(tmp_path):
     assert (report.ok, report.frames) == (True, 2 * len(CAMERAS))
 
 
-def test_refused_frame_of_step_leaves_no_file_of_others(tmp_path):
+def test_refused_frame_leaves_no_file_of_others(tmp_path):
     """Frames before it may be on the disk already, as each is written while the next is made."""
     plan = plan_of(1, len(CAMERAS))
     with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
