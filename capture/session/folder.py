@@ -68,7 +68,7 @@ def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
     """Write new files of one folder, several at once, and flush their data, then their names.
 
     Files are written while further ones are made. After an error, no file of the group is left
-    unless the disk refuses that, too.
+    unless the disk refuses that, too; a file that was there before is not removed.
     """
     parts: dict[Path, Path] = {}
 
@@ -80,6 +80,8 @@ def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
 
     try:
         disk.for_each(lambda file: write_new(disk, *file), name_parts())
+    except FileExistsError:  # resuming sets all aside
+        raise
     except BaseException:
         for part in parts:
             with suppress(OSError):  # the first error is the cause

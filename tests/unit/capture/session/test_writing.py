@@ -141,6 +141,22 @@ def test_refused_frame_leaves_no_file_of_others(tmp_path):
     assert verify(tmp_path / "s").ok
 
 
+def test_file_that_was_there_before_is_kept(tmp_path):
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        stray = session.path / "frames/S000+C01.dng.part"
+        stray.write_bytes(b"of another program")
+        with pytest.raises(SessionDiskError, match="File exists"):
+            commit_step(session, "S000")
+        assert stray.read_bytes() == b"of another program"
+    with Session.resume(session.path) as again:
+        commit_step(again, "S000")
+        again.close()
+    orphans = {path.read_bytes() for path in (session.path / "orphans").iterdir()}
+    assert b"of another program" in orphans
+    assert verify(session.path).ok
+
+
 def test_frames_are_written_while_next_ones_are_made(tmp_path):
     plan = plan_of(1, len(CAMERAS))
     with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
