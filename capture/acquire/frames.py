@@ -1,4 +1,4 @@
-"""Set cameras for a step, and write their frames as files of a session."""
+"""Set cameras for a step, and describe their frames for the files of a session."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -63,7 +63,7 @@ def frame_timeout_s(step: Step, view: View) -> float:
     return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
 
 
-def encode_step_frame(
+def describe_step_frame(
     frame: Frame,
     view: View,
     camera: Camera,
@@ -71,8 +71,8 @@ def encode_step_frame(
     session: Session,
     light: Mapping[str, Value],
     color: raw.CameraColor | None = None,
-) -> bytes:
-    """Encode a frame as our DNG, with its step, its light and the camera's color.
+) -> raw.RawFrame:
+    """Return a frame for encoding, with its step, its light and the camera's color.
 
     A raw file with a color matrix of its own keeps it.
     """
@@ -96,18 +96,16 @@ def encode_step_frame(
         picture = replace(
             picture, color_matrix=color.matrix, color_illuminant="D65", neutral=color.neutral
         )
-    return raw.encode_frame(
-        replace(
-            picture,
-            exposure_s=frame.exposure.exposure_s,
-            iso=frame.exposure.iso,
-            camera_model=info.model,
-            camera_serial=frame.serial,
-            f_number=view.f_number,
-            focal_mm=view.focal_mm,
-            captured_at=None,
-            step_id=step.id,
-            session_id=session.id,
-            light=light,
-        )
+    return replace(
+        picture,
+        exposure_s=frame.exposure.exposure_s,
+        iso=frame.exposure.iso,
+        camera_model=info.model,
+        camera_serial=frame.serial,
+        f_number=view.f_number,
+        focal_mm=view.focal_mm,
+        captured_at=None,
+        step_id=step.id,
+        session_id=session.id,
+        light=light,
     )

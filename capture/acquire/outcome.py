@@ -6,20 +6,24 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import starmap
 
-from capture.acquire.frames import encode_step_frame
+from capture import raw
+from capture.acquire.frames import describe_step_frame
 from capture.devices.box import Box
 from capture.devices.camera import Camera, CameraError, Frame, Trigger
 from capture.devices.led_box import Eyes
 from capture.devices.port import SYSTEM_CLOCK, Clock, DeviceError
 from capture.plan import Plan, Step, Value
-from capture.raw import CameraColor
 from capture.rig import Rig
-from capture.session import Session
+from capture.session import NewFrame, Session
 
 log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3
+MAX_GROUP_BYTES = 2**26
+"""Largest size of frames that are encoded and written together, but for a single one."""
 
 
 class AcquisitionError(DeviceError, RuntimeError):
@@ -121,12 +125,14 @@ class CaptureRun:
     eyes: Eyes = "open"
     force_limit_n: float | None = None
     all_brackets: bool = False
-    camera_colors: Mapping[str, CameraColor] = field(default_factory=dict)
+    camera_colors: Mapping[str, raw.CameraColor] = field(default_factory=dict)
     steps: int = 0
     frames: int = 0
     stale: int = 0
     retakes: int = 0
     _attempts: dict[tuple[str, str], int] = field(init=False)
+    _buffers: dict[int, bytearray] = field(init=False, default_factory=dict)
+    """Memory of the encoded frames that are written together, by their number."""
 
     def __post_init__(self) -> None:
         """Look up the last attempt of each committed frame."""
@@ -153,9 +159,20 @@ class CaptureRun:
         self, step: Step, name: str, frame: Frame, light: Mapping[str, Value]
     ) -> bytes:
         """Return a frame of the view ``name`` as our DNG."""
+        return raw.encode_frame(self._describe(step, name, frame, light))
+
+    def _describe(
+        self, step: Step, name: str, frame: Frame, light: Mapping[str, Value]
+    ) -> raw.RawFrame:
         view, camera = self.rig.view(name), self.cameras[name]
         color = self.camera_colors.get(name)
-        return encode_step_frame(frame, view, camera, step, self.session, light, color)
+        return describe_step_frame(frame, view, camera, step, self.session, light, color)
+
+    def _allocate(self, number: int, size: int) -> memoryview:
+        """Return memory for a frame; the next group uses it again."""
+        if len(self._buffers.get(number, b"")) < size:
+            self._buffers[number] = bytearray(size)
+        return memoryview(self._buffers[number])[:size]
 
     def commit_frames(
         self,
@@ -167,7 +184,7 @@ class CaptureRun:
         t_box_s: float | None,
         journal_entries: Mapping[str, Value],
     ) -> None:
-        """Commit the frames of a step, one per camera.
+        """Commit the frames of a step, one per camera, together.
 
         Parameters
         ----------
@@ -182,22 +199,30 @@ class CaptureRun:
         noted
             Further journal entries of the frames.
         """
-        for name, frame in frames.items():
-            # a step of which only some cameras were kept is repeated with all of them
-            attempt = self._attempts.get((step.id, name), 0) + 1
+        # a step of which only some cameras were kept is repeated with all of them
+        attempts = {name: self._attempts.get((step.id, name), 0) + 1 for name in frames}
+
+        def encode(number: int, name: str) -> NewFrame:
+            frame = frames[name]
+            described = self._describe(step, name, frame, light)
             shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
-            self.session.commit(
-                step.id,
-                name,
-                self.encode_frame(step, name, frame, light),
-                settings=dict(step.settings),
+            return NewFrame(
+                camera=name,
+                blob=raw.encode_frame_into(described, partial(self._allocate, number)),
+                settings=step.settings,
                 actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
                 t_box_s=t_box_s,
                 t_host_s=self.operator.clock(),
-                attempt=attempt,
+                attempt=attempts[name],
             )
-            self._attempts[step.id, name] = attempt
-            self.frames += 1
+
+        images = [frame.image for frame in frames.values()]
+        largest = max(len(one) if isinstance(one, bytes) else one.nbytes for one in images)
+        names, count = list(frames), max(1, MAX_GROUP_BYTES // largest)
+        for group in (names[k : k + count] for k in range(0, len(names), count)):
+            self.session.commit_step(step.id, starmap(encode, enumerate(group)))
+            self._attempts.update({(step.id, name): attempts[name] for name in group})
+            self.frames += len(group)
         self.steps += 1
 
     def note_retake(self, step: Step, attempt: int, reason: object) -> str:

@@ -191,6 +191,11 @@ class Plan(Document):
         fault = Fault("step", repr(step_id), expected, suggest_key(step_id, ids))
         raise PlanError(f"the plan has no step {step_id!r}", faults=[fault])
 
+    @property
+    def max_cameras(self) -> int:
+        """Largest number of cameras of one step."""
+        return max(len(step.cameras) for step in self.steps)
+
     def check(self, rig: Rig) -> None:
         """Raise an error when the plan is for another rig, or names views that it lacks."""
         checks = FaultCollector(f"Plan for rig {self.rig!r}", PlanError)

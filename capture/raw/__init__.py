@@ -1,6 +1,6 @@
 """Raw frames: write and read our own DNG, read foreign files, convert to linear values."""
 
-from capture.raw.dng import encode_dng, encode_frame, write_dng
+from capture.raw.dng import encode_dng, encode_frame, encode_frame_into, write_dng
 from capture.raw.frame import CameraColor, RawError, RawFrame, noise_profile
 from capture.raw.linear import Demosaic, LinearImage, interpolate, linear_mono, linear_rgb
 from capture.raw.reading import decode, read
@@ -14,6 +14,7 @@ __all__ = [
     "decode",
     "encode_dng",
     "encode_frame",
+    "encode_frame_into",
     "interpolate",
     "linear_mono",
     "linear_rgb",

@@ -9,7 +9,7 @@ from capture.session.errors import (
     SessionError,
     SessionLocked,
 )
-from capture.session.journal import AttachmentLine, FrameLine
+from capture.session.journal import AttachmentLine, FrameLine, NewFrame
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, SubjectRecord
 from capture.session.reopening import reopen_copy, resume_unless_complete
 from capture.session.store import Session
@@ -25,6 +25,7 @@ __all__ = [
     "FrameLine",
     "FrameRecord",
     "Manifest",
+    "NewFrame",
     "NotASession",
     "Session",
     "SessionDamage",

@@ -23,7 +23,6 @@ MANIFEST_FILE, JOURNAL_FILE = "session.json", "journal.jsonl"
 FRAMES_FOLDER, ORPHANS_FOLDER, ATTACHMENTS_FOLDER = "frames", "orphans", "attachments"
 MAX_MANIFEST_BYTES = 2**26
 MAX_JOURNAL_BYTES = 2**30
-MAX_UNLISTED_FILES = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +109,8 @@ def read_contents(path: Path, *, sealing: bool = False) -> SessionContents:
     _require_folder(path / FRAMES_FOLDER)
     if os.path.lexists(path / ATTACHMENTS_FOLDER):  # made with the first attachment
         _require_folder(path / ATTACHMENTS_FOLDER)
-    walked = walk_journal(journal, seal=seal, where=str(where))
+    most = manifest.plan.max_cameras
+    walked = walk_journal(journal, seal=seal, where=str(where), max_group=most)
     if walked.damage is None:
         walked = _check_against_plan(walked, manifest, str(where))
     return SessionContents(manifest, walked, consent_seal)
@@ -168,21 +168,23 @@ def unlisted_files(path: Path, contents: SessionContents) -> list[str]:
     return [file for file in list_files(path) if file not in known]
 
 
-def find_lost_lines(path: Path, unlisted: list[str]) -> SessionDamage | None:
+def find_lost_lines(
+    path: Path, contents: SessionContents, unlisted: list[str]
+) -> SessionDamage | None:
     """Return the error of an open session whose journal has lost lines, None when it has not.
 
-    One process writes one file after the other under its name, and a line after each: an
-    interruption leaves at most `MAX_UNLISTED_FILES` without one.
+    One process gives the files of one step their names, and then writes their lines: an
+    interruption leaves at most one step's files without lines.
     """
     files = [file for file in unlisted if not file.endswith(".part")]
-    if len(files) <= MAX_UNLISTED_FILES:
+    if len(files) <= (most := contents.manifest.plan.max_cameras):
         return None
     journal = path / JOURNAL_FILE
     got = f"{len(files)} files without a line, first {files[0]}"
     return SessionDamage(
         "is incomplete: lines are lost",
         where=str(journal),
-        faults=[Fault("journal", got, f"at most {MAX_UNLISTED_FILES}, after an interruption")],
+        faults=[Fault("journal", got, f"at most {most}, after an interruption")],
         advice=f"Restore {JOURNAL_FILE} from a copy; without one, capture a new session.",
         code="SR-SES-014",
     )

@@ -123,7 +123,7 @@ def copy_session(
         lost = (
             None
             if contents.walk.closed
-            else find_lost_lines(place, unlisted_files(place, contents))
+            else find_lost_lines(place, contents, unlisted_files(place, contents))
         )
         if lost is not None:
             raise lost

@@ -6,14 +6,21 @@ Reading needs no such care: it is one function.
 import fcntl
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 from capture.documents import Fault
 from capture.session.errors import SessionDamage, SessionError
 
 _E = TypeVar("_E", bound=SessionError)
+ItemT = TypeVar("ItemT")
+Blob: TypeAlias = bytes | memoryview
+"""Bytes of a file."""
+
+N_WRITERS: Final = 16
+"""Files written at the same time: the dome's step, whose flushes the file system joins."""
 
 
 class Disk:
@@ -39,7 +46,7 @@ class Disk:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
         return os.open(path, flags, 0o600)
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write all of ``data``, in one system call unless the kernel takes less."""
         rest = memoryview(data)
         while rest:
@@ -64,6 +71,16 @@ class Disk:
     def remove(self, path: Path) -> None:
         """Remove a file's name."""
         os.unlink(path)
+
+    def for_each(self, work: Callable[[ItemT], object], items: Iterable[ItemT]) -> None:
+        """Do work for each item on threads, while this one makes the next items.
+
+        After an error, no further item is begun. It returns, or raises the first error, once no
+        work is left. A model of the disk does one after the other.
+        """
+        with ThreadPoolExecutor(N_WRITERS) as pool:
+            for _ in pool.map(work, items):
+                pass
 
     def fsync_dir(self, path: Path) -> None:
         """Flush the names in a directory to the medium."""

@@ -2,12 +2,15 @@
 
 import logging
 import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
 from capture.session.consent_seal import KEY_VARIABLE, SEAL_FILE, make_seal, read_key
 from capture.session.contents import (
+    ATTACHMENTS_FOLDER,
     FRAMES_FOLDER,
     JOURNAL_FILE,
     MANIFEST_FILE,
@@ -19,7 +22,7 @@ from capture.session.contents import (
     read_contents,
     unlisted_files,
 )
-from capture.session.disk import Disk, read_file
+from capture.session.disk import Blob, Disk, read_file
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
 _log = logging.getLogger(__name__)
@@ -51,7 +54,7 @@ class DiskErrors:
             raise SessionDiskError(what, where=where, advice=self._advice, code=code) from value
 
 
-def write_new(disk: Disk, path: Path, data: bytes) -> None:
+def write_new(disk: Disk, path: Path, data: Blob) -> None:
     """Write a new file and flush its data; the caller flushes its name."""
     descriptor = disk.create(path)
     try:
@@ -59,6 +62,35 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
         disk.fsync(descriptor)
     finally:
         disk.close(descriptor)
+
+
+def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
+    """Write new files of one folder, several at once, and flush their data, then their names.
+
+    Files are written while further ones are made. After an error, no file of the group is left
+    unless the disk refuses that, too; a file that was there before is not removed.
+    """
+    parts: dict[Path, Path] = {}
+
+    def name_parts() -> Iterator[tuple[Path, Blob]]:
+        for path, blob in files:
+            part = path.with_name(f"{path.name}.part")
+            parts[part] = path
+            yield part, blob
+
+    try:
+        disk.for_each(lambda file: write_new(disk, *file), name_parts())
+    except FileExistsError:  # resuming sets all aside
+        raise
+    except BaseException:
+        for part in parts:
+            with suppress(OSError):  # the first error is the cause
+                disk.remove(part)
+        raise
+    for part, path in parts.items():
+        disk.rename(part, path)
+    for folder in {path.parent for path in parts.values()}:
+        disk.fsync_dir(folder)
 
 
 def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
@@ -78,6 +110,13 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
         if not (path / JOURNAL_FILE).exists():
             write_new(disk, path / JOURNAL_FILE, b"")
         write_manifest(disk, path, manifest)
+
+
+def make_attachments_folder(disk: Disk, path: Path) -> None:
+    """Make the folder of attachments, also where an interruption left its name unflushed."""
+    if not (path / ATTACHMENTS_FOLDER).is_dir():
+        disk.make_dir(path / ATTACHMENTS_FOLDER)
+    disk.fsync_dir(path)
 
 
 def write_consent_seal(disk: Disk, path: Path, manifest: bytes) -> None:
@@ -181,7 +220,7 @@ def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
     lines = {line.file: line for line in contents.file_lines}
     present = list_files(path)
     orphans = unlisted_files(path, contents)
-    if (lost := find_lost_lines(path, orphans)) is not None:
+    if (lost := find_lost_lines(path, contents, orphans)) is not None:
         raise lost
     for line in lines.values():
         size = (path / line.file).lstat().st_size if line.file in present else None

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import xxhash
+
 from capture.documents import (
     Document,
     Fault,
@@ -25,6 +27,7 @@ from capture.documents import (
 from capture.former_names import translate_names
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
+from capture.session.disk import Blob
 from capture.session.errors import SessionDamage, SessionError
 
 MAX_LINE_BYTES = 65_536
@@ -62,6 +65,41 @@ class FrameLine(Document):
         good = _XXH128_PATTERN.fullmatch(self.xxh128) is not None
         checks.check("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewFrame:
+    """One frame of a step, and what its journal line contains."""
+
+    camera: str
+    """One of the step's cameras."""
+    blob: Blob
+    """A DNG of ours that names the step and the session."""
+    settings: Mapping[str, Value]
+    """Requested settings."""
+    actual: Mapping[str, Value]
+    """Settings that controller and camera report."""
+    t_box_s: float | None = None
+    """Time of the exposure on the controller's clock, s; None without a controller."""
+    t_host_s: float
+    """Time of arrival on the host's clock, s."""
+    attempt: int = 1
+    """1, or one more than the last attempt for a frame taken again."""
+
+    def line(self, step_id: str) -> FrameLine:
+        """Return the journal line of the frame."""
+        return FrameLine(
+            step=step_id,
+            camera=self.camera,
+            attempt=self.attempt,
+            file=frame_path(step_id, self.camera, self.attempt),
+            bytes=len(self.blob),
+            xxh128=xxhash.xxh3_128_hexdigest(self.blob),
+            settings=dict(self.settings),
+            actual=dict(self.actual),
+            t_box_s=None if self.t_box_s is None else float(self.t_box_s),
+            t_host_s=float(self.t_host_s),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,8 +243,16 @@ def seal_bounded_line(previous: str, line: Line) -> tuple[bytes, str]:
     return text, head
 
 
-def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
-    """Follow the chain from ``seal`` to the last line, a truncated line, or the first damage."""
+def walk_journal(data: bytes, *, seal: str, where: str, max_group: int = 1) -> JournalWalk:
+    """Follow the chain from ``seal`` to the last line, truncated lines, or the first damage.
+
+    Parameters
+    ----------
+    data, seal, where
+        The journal, the seal of its manifest, and its name for messages.
+    max_group
+        Largest number of lines written at once.
+    """
     lines: list[tuple[int, Line]] = []
     head, start = seal, 0
     while start < len(data):
@@ -220,7 +266,8 @@ def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
         try:
             line, digest = _unseal(text, head, f"{where}, byte {start}")
         except SessionDamage as exc:
-            if _is_torn(text, stop < 0, last=start + len(text) == len(data), head=head):
+            left = data.count(b"\n", start) + (not data.endswith(b"\n"))
+            if _is_torn(text, unended=stop < 0, last=left <= max_group, head=head):
                 return JournalWalk(tuple(lines), head, start, len(data) - start, None)
             return JournalWalk(tuple(lines), head, start, 0, exc)
         if line is None:  # complete but for its newline: was never acknowledged
@@ -260,12 +307,23 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
     )
 
 
-def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
+def _is_torn(text: bytes, *, unended: bool, last: bool, head: str) -> bool:
     """Return whether a bad line looks like the truncated end of an interrupted write.
 
-    An interrupted write leaves a prefix of the line, zeros, or a prefix and zeros. A flipped bit
-    leaves at most one zero byte, and a line whose newline was hit is one byte longer than a whole
-    record: these are damage to an acknowledged line.
+    An interrupted write leaves a prefix of its lines, zeros, a prefix and zeros, or a hole of zeros
+    before further lines. A flipped bit leaves at most one zero byte, and a line whose newline was
+    hit is one byte longer than a whole record: these are damage to an acknowledged line.
+
+    Parameters
+    ----------
+    text
+        The bad line.
+    unended
+        Whether its newline is missing.
+    last
+        Whether it and all after it may be of one write.
+    head
+        Hash of the line before.
     """
     if not last:
         return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,23 +15,24 @@ import xxhash
 from capture.documents import Fault, FaultCollector, short_repr
 from capture.plan import Plan, Value
 from capture.rig import Rig
-from capture.session.contents import (
-    ATTACHMENTS_FOLDER,
-    JOURNAL_FILE,
-    SessionContents,
-    read_undamaged_contents,
-)
-from capture.session.disk import Disk
+from capture.session.contents import JOURNAL_FILE, SessionContents, read_undamaged_contents
+from capture.session.disk import Blob, Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
-from capture.session.folder import DiskErrors, make_folder, move_orphans, write_new
+from capture.session.folder import (
+    DiskErrors,
+    make_attachments_folder,
+    make_folder,
+    move_orphans,
+    write_group,
+)
 from capture.session.journal import (
     ATTACHMENT_RULE,
     AttachmentLine,
     CloseLine,
     FrameLine,
+    NewFrame,
     OmissionLine,
     attachment_path,
-    frame_path,
     is_attachment_name,
     seal_bounded_line,
 )
@@ -204,58 +205,43 @@ class Session(SessionView):
                 raise
         return cls(place, contents, disk=disk, descriptor=descriptor)
 
-    def commit(
-        self,
-        step_id: str,
-        camera: str,
-        blob: bytes,
-        *,
-        settings: Mapping[str, Value],
-        actual: Mapping[str, Value],
-        t_box_s: float | None = None,
-        t_host_s: float,
-        attempt: int = 1,
-    ) -> None:
-        """Write one frame to the medium; when this returns, it survives a power cut.
+    def commit(self, step_id: str, camera: str, blob: Blob, **about: Any) -> None:
+        """Write one frame to the medium, as `commit_step`; ``about`` are fields of `NewFrame`."""
+        self.commit_step(step_id, [NewFrame(camera=camera, blob=blob, **about)])
+
+    def commit_step(self, step_id: str, frames: Iterable[NewFrame]) -> None:
+        """Write frames of a step to the medium; when this returns, they survive a power cut.
+
+        Their files are flushed several at once, then their names together, then their lines. After
+        an interruption all frames count, or the first ones, or none. A generator of frames makes
+        the next ones while others are written.
 
         Parameters
         ----------
-        step_id, camera : str
-            Step of the plan and one of its cameras.
-        blob : bytes
-            A DNG of ours that names the same step and this session.
-        settings, actual : mapping
-            Requested settings, and those that controller and camera report.
-        t_box_s : float or None
-            Time of the exposure on the controller's clock, s.
-        t_host_s : float
-            Time of arrival on the host's clock, s.
-        attempt : int
-            1, or one more than the last attempt for a frame taken again.
+        step_id : str
+            Step of the plan.
+        frames : iterable of NewFrame
+            Each of another camera.
 
         Raises
         ------
         SessionError
-            When the frame does not fit the plan; nothing is written.
+            When a frame does not fit the plan; nothing is left of the group.
         SessionDiskError
             When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
-        self._check_commit(step_id, camera, blob, attempt)
-        line = FrameLine(
-            step=step_id,
-            camera=camera,
-            attempt=attempt,
-            file=frame_path(step_id, camera, attempt),
-            bytes=len(blob),
-            xxh128=xxhash.xxh3_128_hexdigest(blob),
-            settings=dict(settings),
-            actual=dict(actual),
-            t_box_s=None if t_box_s is None else float(t_box_s),
-            t_host_s=float(t_host_s),
-        )
-        self._write(descriptor, line, blob)
-        self._lines.setdefault((step_id, camera), []).append(line)
+        lines: dict[str, FrameLine] = {}
+
+        def check() -> Iterator[tuple[FrameLine, Blob]]:
+            for frame in frames:
+                self._check_commit(step_id, frame, others=lines)
+                lines[frame.camera] = frame.line(step_id)
+                yield lines[frame.camera], frame.blob
+
+        self._write(descriptor, check())
+        for line in lines.values():
+            self._lines.setdefault((step_id, line.camera), []).append(line)
 
     def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
         """Attach a file other than a frame; when this returns, it survives a power cut.
@@ -295,7 +281,10 @@ class Session(SessionView):
             xxh128=xxhash.xxh3_128_hexdigest(data),
             about=dict(about or {}),
         )
-        self._write(descriptor, line, bytes(data))
+        if not self._attached:
+            with self._released_on_failure():
+                make_attachments_folder(self._disk, self.path)
+        self._write(descriptor, [(line, bytes(data))])
         self._attached[name] = line
 
     def omit_steps(
@@ -345,28 +334,33 @@ class Session(SessionView):
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
         )
         text, head = seal_bounded_line(self._head, line)
-        with self._acknowledging(head):
+        with self._released_on_failure():
             self._append(descriptor, text)
+        self._head = head
         self._left_out.update(dict.fromkeys(line.steps, line))
 
-    def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
-        """Write a file and then its line of the journal to the medium."""
-        text, head = seal_bounded_line(self._head, line)
-        target = self.path / line.file
-        part = target.with_name(target.name + ".part")
-        with self._acknowledging(head):
-            if isinstance(line, AttachmentLine) and not self._attached:
-                if not target.parent.is_dir():
-                    self._disk.make_dir(self.path / ATTACHMENTS_FOLDER)
-                self._disk.fsync_dir(self.path)
-            write_new(self._disk, part, blob)
-            self._disk.rename(part, target)
-            self._disk.fsync_dir(target.parent)
-            self._append(descriptor, text)
+    def _write(
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
+    ) -> None:
+        """Write files of one folder, and then their lines of the journal, to the medium."""
+        text, head = b"", self._head
+
+        def seal() -> Iterator[tuple[Path, Blob]]:
+            nonlocal text, head
+            for line, blob in files:
+                sealed, head = seal_bounded_line(head, line)
+                text += sealed
+                yield self.path / line.file, blob
+
+        with self._released_on_failure():
+            write_group(self._disk, seal())
+            if text:
+                self._append(descriptor, text)
+        self._head = head
 
     @contextmanager
-    def _acknowledging(self, head: str) -> Iterator[None]:
-        """Advance to a head after its line is written; release the session on failure."""
+    def _released_on_failure(self) -> Iterator[None]:
+        """Release the session when the disk refuses."""
         try:
             with DiskErrors(self.path):
                 yield
@@ -374,7 +368,6 @@ class Session(SessionView):
             # how much reached the medium is unknown: only resume() can find out
             self.release()
             raise
-        self._head = head
 
     def close(self, *, missing_reason: str = "") -> None:
         """Close the session for good: nothing can be added afterwards.
@@ -428,22 +421,25 @@ class Session(SessionView):
             raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
         return self._descriptor
 
-    def _check_commit(self, step_id: str, camera: str, blob: bytes, attempt: int) -> None:
-        step = self.plan.step(step_id)
+    def _check_commit(self, step_id: str, frame: NewFrame, others: Container[str]) -> None:
+        step, camera = self.plan.step(step_id), frame.camera
         if camera not in step.cameras:
             faults = [Fault("camera", short_repr(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
+        if camera in others:
+            faults = [Fault("camera", short_repr(camera), "one frame of each camera")]
+            raise SessionError(f"step {step_id!r} has two frames of a camera", faults=faults)
         if step_id in self._left_out:
             faults = [Fault("step", short_repr(step_id), "one that was not omitted")]
             raise SessionError("the step was omitted", where=str(self.path), faults=faults)
         done = self._lines.get((step_id, camera), [])
         expected = done[-1].attempt + 1 if done else 1
-        if attempt < 1 or (done and attempt != expected):
-            faults = [Fault("attempt", str(attempt), f"{expected}")]
+        if frame.attempt < 1 or (done and frame.attempt != expected):
+            faults = [Fault("attempt", str(frame.attempt), f"{expected}")]
             advice = "A committed frame is never replaced; take it with the next attempt number."
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
-        check_blob(blob, step_id, self.id)
+        check_blob(frame.blob, step_id, self.id)
 
     def _append(self, descriptor: int, text: bytes) -> None:
         self._disk.write(descriptor, text)

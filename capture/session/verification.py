@@ -54,7 +54,7 @@ class VerifyReport:
     bytes: int
     """Bytes of those frames and of the intact attachments."""
     complete: bool = True
-    """Whether the journal has a line for each file but one that an interruption may leave."""
+    """Whether the journal has a line for each file but those that an interruption may leave."""
     consent_seal: str = UNSEALED_STATE
     """Whether a key of the lab has sealed the consent, and whether the seal was checked."""
     refused_seal: str = ""
@@ -119,7 +119,7 @@ def verify(
         problems.append(str(contents.walk.damage))
     frames, size = _check_files(place, contents.file_lines, problems, progress)
     unlisted = unlisted_files(place, contents) if contents.walk.damage is None else []
-    lost = None if contents.walk.closed else find_lost_lines(place, unlisted)
+    lost = None if contents.walk.closed else find_lost_lines(place, contents, unlisted)
     if lost is None:
         advice = "it was never acknowledged; resuming sets it aside"
         strays = problems if contents.walk.closed else warnings

@@ -11,7 +11,7 @@ from capture import raw
 from capture.documents import Fault, short_repr
 from capture.plan import Step, Value
 from capture.session.contents import SessionContents
-from capture.session.disk import read_file
+from capture.session.disk import Blob, read_file
 from capture.session.errors import ConsentError, SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, FrameLine, OmissionLine
 from capture.session.manifest import ANY_USE
@@ -82,7 +82,7 @@ def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
     return blob
 
 
-def check_blob(blob: bytes, step_id: str, session_id: str) -> None:
+def check_blob(blob: Blob, step_id: str, session_id: str) -> None:
     """Reject a frame that is too large or that names another step or session."""
     if len(blob) > MAX_FRAME_BYTES:
         faults = [Fault("blob", f"{len(blob)} bytes", f"at most {MAX_FRAME_BYTES}")]

@@ -38,6 +38,8 @@ class ResourceForecast:
     """Peak address space of one process, which `ulimit -v` limits."""
     disk_mb: float
     """Files of the output."""
+    temporary_mb: float = 0.0
+    """Largest size of a temporary file on the output's disk; less space makes work slower."""
 
     def fits(self, free: FreeMemory) -> bool:
         """Return whether memory and address space are below what is free.
@@ -184,13 +186,41 @@ def require_resources(
             + _advise_smaller(smaller or {}, free)
             + f"{advice} [SR-CLI-016]"
         )
-    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
-    free_mb = shutil.disk_usage(place).free * 1e-6
+    free_mb = _free_mb(out)
     if need.disk_mb > free_mb:
         raise UnusableError(
             f"--out: {out}: {work} writes about {_gb(need.disk_mb)}, {_gb(free_mb)} free; nothing "
             "was computed: free space, or name another disk [SR-CLI-017]"
         )
+
+
+def temporary_room_mb(need: ResourceForecast, out: Path) -> float:
+    """Return the size that a temporary file may have: at most half of the space left, MB.
+
+    Parameters
+    ----------
+    need
+        Forecast of the work.
+    out
+        Output, whose disk is tried.
+    """
+    return min(need.temporary_mb, max(0.0, (_free_mb(out) - need.disk_mb) / 2.0))
+
+
+def describe_disk(need: ResourceForecast, out: Path) -> str:
+    """Describe the space that an output and a temporary file take, and whether the file fits."""
+    text = f"disk: about {_gb(need.disk_mb)}"
+    if need.temporary_mb:
+        text += f", and up to {_gb(need.temporary_mb)} of temporary images until the end"
+        room_mb = temporary_room_mb(need, out)
+        if room_mb < need.temporary_mb:
+            text += f"; {_gb(room_mb)} of these fit, other images are rendered more than once"
+    return text
+
+
+def _free_mb(out: Path) -> float:
+    place = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    return shutil.disk_usage(place).free * 1e-6
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, cast
@@ -36,7 +35,7 @@ from rigsim.targets import make_target
 from skinrig.console import select_attributes
 from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
-from skinrig.resources.forecast import count_megapixels, forecast_resources
+from skinrig.resources.forecast import temporary_room_mb
 from skinrig.simulating import driving, reference
 from skinrig.simulating.orders import (
     DomeOrder,
@@ -72,7 +71,7 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     conditions = _conditions(order)
     reference.check_dome_order(order)
     rig, plan = plan_capture(order)
-    driving.require_room(order, rig, plan)
+    driving.require_room(order, rig, plan, temporary_mb=1e-6 * count_image_bytes(order, rig, plan))
     light = driving.announce_light(plan, rig, order)
     settings = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
@@ -118,23 +117,38 @@ def _expect_images(
     """
     if order.target is not None:
         return nullcontext()
+    scene.expect_requests(_list_requests(rig, plan))
+    if not (image_bytes := count_image_bytes(order, rig, plan)):
+        return nullcontext()
+    need = driving.forecast_rest(order, rig, plan, temporary_mb=1e-6 * image_bytes)
+    most_bytes = int(1e6 * temporary_room_mb(need, order.out))
+    images = scene.images.render_ahead(order.out.parent, most_bytes)
+    return cast(AbstractContextManager[None], images)
+
+
+def _list_requests(rig: Rig, plan: Plan) -> list[tuple[str, int]]:
+    """Return camera and light of each image that a plan's frames are made of, in order."""
     number = {light.name: k for k, light in enumerate(rig.lights)}
-    requests = [
+    return [
         (camera, number[light])
         for step in plan.steps
         for camera in step.cameras
         for light in step_lights(step)
     ]
-    scene.expect_requests(requests)
+
+
+def count_image_bytes(order: DomeOrder, rig: Rig, plan: Plan) -> int:
+    """Return the largest size of the file of images that wait for requests; 0: without a file.
+
+    Memory keeps the images of a small dome, those of a target, and those of a head that moves.
+    """
+    if order.target is not None or order.move:
+        return 0
     pixels = {view.name: view.width_px * view.height_px for view in rig.all_views}
-    sizes = [np.dtype(np.float32).itemsize * pixels[camera] for camera, _ in set(requests)]
+    images = set(_list_requests(rig, plan))
+    sizes = [np.dtype(np.float32).itemsize * pixels[camera] for camera, _ in images]
     fits = max(sizes, default=0) <= SMALL_IMAGE_BYTES and sum(sizes) <= IMAGE_CACHE_BYTES
-    if fits or order.move:
-        return nullcontext()
-    need = forecast_resources("simulate dome", count_megapixels(rig, plan))
-    free = shutil.disk_usage(order.out).free - 1e6 * need.disk_mb
-    folder, most_bytes = order.out.parent, max(0, int(free) // 2)
-    return cast(AbstractContextManager[None], scene.images.render_ahead(folder, most_bytes))
+    return 0 if fits else sum(sizes)
 
 
 def _manifest_settings(

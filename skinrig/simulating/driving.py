@@ -27,7 +27,9 @@ from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.console import format_count
 from skinrig.resources.forecast import (
+    ResourceForecast,
     count_megapixels,
+    describe_disk,
     forecast_resources,
     forecast_smaller_widths,
     measure_folder_mb,
@@ -228,27 +230,42 @@ def derive_session_id(
     return hashlib.sha256(canonical_json(content)).hexdigest()[:32]
 
 
-def require_room(order: SimulationOrder, rig: Rig, plan: Plan) -> None:
-    """Raise unless memory and disk suffice for what a simulation lacks.
+def require_room(order: SimulationOrder, rig: Rig, plan: Plan, temporary_mb: float = 0.0) -> None:
+    """Raise unless memory and disk suffice for what a simulation lacks; report the disk space.
 
     Voxels of skin are not forecast. A resumed session that has all frames needs no more.
+
+    Parameters
+    ----------
+    order, rig, plan
+        Order of the simulation, its rig, and its plan.
+    temporary_mb
+        Largest size of a temporary file, which is reported, but not required.
     """
     if order.renderer != "mitsuba":
         return
-    held_mb = 0.0
     if order.resume:
         with suppress(SessionError):  # a session that cannot be read is refused on resuming
             if Session.open(order.out).complete:
                 return
-        held_mb = measure_folder_mb(order.out)
     work = f"simulate {order.rig}"
     amounts = count_megapixels(rig, plan)
     smaller = {}
     if hasattr(order, "width_px") and not order.resume:
         smaller = forecast_smaller_widths(work, rig.views[0].width_px, amounts)
-    need = forecast_resources(work, amounts)
-    need = replace(need, disk_mb=need.disk_mb - held_mb)
+    need = forecast_rest(order, rig, plan, temporary_mb)
     require_resources(work, need, order.out, smaller=smaller)
+    if temporary_mb and order.progress is not None:
+        order.progress(describe_disk(need, order.out))
+
+
+def forecast_rest(
+    order: SimulationOrder, rig: Rig, plan: Plan, temporary_mb: float
+) -> ResourceForecast:
+    """Forecast memory and disk of a simulation without the files that a resumed one has."""
+    need = forecast_resources(f"simulate {order.rig}", count_megapixels(rig, plan))
+    held_mb = measure_folder_mb(order.out) if order.resume else 0.0
+    return replace(need, disk_mb=need.disk_mb - held_mb, temporary_mb=temporary_mb)
 
 
 def announce_light(plan: Plan, rig: Rig, order: SimulationOrder) -> Mapping[str, float | str]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from capture.session.contents import (
     ORPHANS_FOLDER,
     SessionContents,
 )
-from capture.session.disk import Disk, read_file
+from capture.session.disk import Blob, Disk, read_file
 from capture.session.journal import AttachmentLine, FrameLine, seal_bounded_line
 from capture.session.manifest import decode
 from capture.session.view import check_file
@@ -114,7 +114,7 @@ class ExposureStore:
         part.rename(path)
         self._keys[digest] = key
 
-    def note_commit(self, file: str, blob: bytes) -> None:
+    def note_commit(self, file: str, blob: Blob) -> None:
         """Record the file of a committed image, and remove the image from the store."""
         key = self._keys.pop(_digest(raw.decode(memoryview(blob), where=file).cfa), None)
         if key is None:
@@ -191,14 +191,26 @@ class ReplayedSession(Session):
         super().close(missing_reason=missing_reason)
         self.exposures.remove()
 
-    def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
-        text, head = seal_bounded_line(self._head, line)
-        if self._replay(text):
+    def _write(
+        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
+    ) -> None:
+        written: list[tuple[FrameLine | AttachmentLine, Blob]] = []
+
+        def note() -> Iterator[tuple[FrameLine | AttachmentLine, Blob]]:
+            for file in files:
+                written.append(file)
+                yield file
+
+        fresh = note()
+        while self._recorded and (file := next(fresh, None)) is not None:
+            # an interruption may have recorded the first lines alone
+            text, head = seal_bounded_line(self._head, file[0])
+            self._replay(text)
             self._head = head
-        else:
-            super()._write(descriptor, line, blob)
-        if isinstance(line, FrameLine) or "camera" in line.about:
-            self.exposures.note_commit(line.file, blob)
+        super()._write(descriptor, fresh)
+        for line, blob in written:
+            if isinstance(line, FrameLine) or "camera" in line.about:
+                self.exposures.note_commit(line.file, blob)
 
     def _append(self, descriptor: int, text: bytes) -> None:
         # lines of frames and attachments were compared before their files were written

@@ -1,6 +1,6 @@
 """Run one host against a simulated rig: open, capture or resume, end; with at most one fault."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -13,7 +13,7 @@ from capture.acquire import CaptureInterrupted, Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.devices.port import Port, PortBusy
 from capture.plan import Plan
-from capture.session import Session, SubjectRecord
+from capture.session import NewFrame, Session, SubjectRecord
 from rigsim.world import World
 from rigsim.world.line_faults import LineTap
 from skinrig.capturing.acquisition import discard_unused_session
@@ -66,11 +66,13 @@ class WitnessedSession(Session):
 
     ledger: Ledger
 
-    def commit(self, step_id: str, camera: str, blob: bytes, **about: Any) -> None:
-        """Commit a frame; see `Session.commit`."""
-        super().commit(step_id, camera, blob, **about)
-        key = (step_id, camera, int(about.get("attempt", 1)))
-        self.ledger.frames[key] = xxhash.xxh3_128_hexdigest(blob)
+    def commit_step(self, step_id: str, frames: Iterable[NewFrame]) -> None:
+        """Commit frames of a step; see `Session.commit_step`."""
+        committed = list(frames)
+        super().commit_step(step_id, committed)
+        for frame in committed:
+            key = (step_id, frame.camera, frame.attempt)
+            self.ledger.frames[key] = xxhash.xxh3_128_hexdigest(frame.blob)
 
 
 class HostTap:

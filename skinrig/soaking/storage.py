@@ -7,13 +7,13 @@ name that was not synced in its folder is there or not.
 import errno
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from capture.session.disk import Disk
+from capture.session.disk import Blob, Disk, ItemT
 from skinrig.soaking.host_life import HostLife
 
 DATA_FATES: Final[Mapping[str, Callable[[bytes], bytes]]] = {
@@ -72,6 +72,11 @@ class LoggedDisk(Disk):
         """Return a path relative to the root."""
         return os.path.relpath(path, self.root)
 
+    def for_each(self, work: Callable[[ItemT], object], items: Iterable[ItemT]) -> None:
+        """Do work for one item after the other, so that each run has the same log."""
+        for item in items:
+            work(item)
+
     def make_dir(self, path: Path) -> None:
         """Make a directory; see `Disk`, as for all operations."""
         super().make_dir(path)
@@ -94,7 +99,7 @@ class LoggedDisk(Disk):
         self.opened[descriptor] = (self.name(path), self.known[number])
         return descriptor
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write data."""
         super().write(descriptor, data)
         self.note("write", self.opened[descriptor][1], bytes(data))
@@ -233,7 +238,7 @@ class FaultyDisk(LoggedDisk):
         """Open a file for appending."""
         return int(self._run("open_append", super().open_append, path))
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def write(self, descriptor: int, data: Blob) -> None:
         """Write data."""
         self._run("write", super().write, descriptor, data)
 

@@ -5,10 +5,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from fixtures.small_sessions import CAMERAS, DOME, commit_step, fill_of, plan_of
 
-from capture import raw
-from capture.plan import Plan, Step
-from capture.rig import load_rig
 from capture.session import Disk, Session, SessionDiskError, SubjectRecord, verify
 from capture.session.consent_seal import KEY_VARIABLE, SEALED_STATE
 from skinrig.capturing.acquisition import discard_unused_session
@@ -16,73 +14,93 @@ from skinrig.console import Console
 from skinrig.soaking.host_life import HostKilled
 from skinrig.soaking.storage import DISK_FAULTS, FaultyDisk
 
-RIG = load_rig("flash").resized(16)
-FRAMES = 3
-PLAN = Plan("flash", tuple(Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(FRAMES)))
 SCAN = b"ply: a scan"
+CREATION = 16
+"""Operations that create a session."""
+ONE_CAMERA, SEVERAL_CAMERAS = plan_of(3, 1), plan_of(3, len(CAMERAS))
 
 
-def create(path, disk):
+def create(path, disk, plan):
     words = {"devices": {}, "subject": SubjectRecord("P1"), "source": "simulated"}
-    return Session.create(path, plan=PLAN, rig=RIG, session_id="disk", disk=disk, **words)
+    return Session.create(path, plan=plan, rig=DOME, session_id="disk", disk=disk, **words)
 
 
-def capture(path, disk, acknowledged, *, resume):
+def capture(path, disk, acknowledged, plan, *, resume):
     """Capture what is missing, as the command does; note what was acknowledged."""
     fresh = not path.exists()
-    session = Session.resume(path, disk=disk) if resume else create(path, disk)
+    session = Session.resume(path, disk=disk) if resume else create(path, disk, plan)
     unused = discard_unused_session(session, fresh, Console(True))
     with contextlib.nullcontext() if resume else unused:
-        for step, _ in session.pending_frames():
-            values = np.full((10, 16), 600 + int(step.id[1:]), np.uint16)
-            words = {"pattern": "RGGB", "black": 512, "white": 16383}
-            blob = raw.encode_dng(values, **words, step_id=step.id, session_id=session.id)
-            session.commit(step.id, "cam", blob, settings={}, actual={}, t_host_s=0.0)
-            acknowledged.add(step.id)
+        for step in dict.fromkeys(step.id for step, _ in session.pending_frames()):
+            commit_step(session, step)
+            acknowledged.add(step)
             if not session.attachments():
                 session.attach("scan.ply", SCAN)
                 acknowledged.add("scan.ply")
         session.close()
 
 
-def strike(path, number, fault, acknowledged, *, resume=False):
+def strike(path, number, fault, acknowledged, plan=ONE_CAMERA, *, resume=False):
     """Capture on a disk whose operation ``number`` fails; return its name, empty for none."""
     disk = FaultyDisk(path.parent, strike=number, fault=fault)
     with contextlib.suppress(SessionDiskError, HostKilled):
-        capture(path, disk, acknowledged, resume=resume)
+        capture(path, disk, acknowledged, plan, resume=resume)
     disk.close_all()
     return disk.struck
 
 
-def finish(path, acknowledged):
+def finish(path, acknowledged, plan=ONE_CAMERA):
     """Go on as the operator would: resume what is a session, else start a new one."""
     if not (path / "session.json").exists():
         assert not acknowledged
-        capture(path, Disk(), acknowledged, resume=False)
+        capture(path, Disk(), acknowledged, plan, resume=False)
     elif not Session.open(path).complete:
-        capture(path, Disk(), acknowledged, resume=True)
+        found = {(r.step_id, r.camera) for r in Session.open(path).frames()}
+        for step in plan.steps:
+            frames = {(step.id, name) for name in step.cameras}
+            assert frames <= found or step.id not in acknowledged
+        capture(path, Disk(), acknowledged, plan, resume=True)
     session = Session.open(path)
     assert session.complete
     assert acknowledged <= {*session.attachments(), *(r.step_id for r in session.frames())}
     for record in session.frames():
-        assert set(np.unique(session.read(record).cfa)) == {600 + int(record.step_id[1:])}
+        fill = fill_of(record.step_id, record.camera)
+        assert set(np.unique(session.read(record).cfa)) == {fill}
     assert verify(path).ok
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", DISK_FAULTS)
-def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
+@pytest.mark.parametrize("plan", [ONE_CAMERA, SEVERAL_CAMERAS], ids=["one", "several"])
+def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault, plan):
     struck = Counter()
     while True:
         path, acknowledged = tmp_path / f"s{struck.total()}", set()
-        name = strike(path, struck.total() + 1, fault, acknowledged)
+        name = strike(path, struck.total() + 1, fault, acknowledged, plan)
         if not name:
             break
         struck[name] += 1
-        finish(path, acknowledged)
+        finish(path, acknowledged, plan)
     print(f"{fault}: {struck.total()} operations: {dict(struck)}")
     assert struck.total() >= 30
     assert {"create", "write", "fsync", "fdatasync", "rename", "fsync_dir"} <= set(struck)
+
+
+@pytest.mark.parametrize("fault", ["ENOSPC", "kill after"])
+def test_fault_in_step_of_several_cameras(tmp_path, fault):
+    """Each operation of the first step, from its first file to its lines."""
+    struck, written = Counter(), 0
+    for number in range(CREATION + 1, CREATION + 1 + 4 * len(CAMERAS) + 3):
+        path, acknowledged = tmp_path / f"s{number}", set()
+        struck[strike(path, number, fault, acknowledged, SEVERAL_CAMERAS)] += 1
+        if (path / "frames").is_dir():
+            written = max(written, len(list((path / "frames").glob("*.dng"))))
+        finish(path, acknowledged, SEVERAL_CAMERAS)
+    assert struck == {
+        **dict.fromkeys(("create", "fsync", "rename"), len(CAMERAS)),
+        **{"write": len(CAMERAS) + 1, "fsync_dir": 1, "fdatasync": 1},
+    }
+    assert written == len(CAMERAS)
 
 
 @pytest.mark.parametrize("fault", ["ENOSPC", "kill"])

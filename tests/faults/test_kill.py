@@ -1,8 +1,9 @@
 """A writer killed with SIGKILL at random instants loses nothing that it acknowledged.
 
 A nursery process imports the package once and forks writers. A writer resumes (or creates) the
-session, commits one frame after the other and, when a commit has returned, writes the step's id to
-a pipe: the acknowledgement. The test kills it after a random time and looks at what is there.
+session, commits the frames of one step after the other and, when a commit has returned, writes the
+step's id to a pipe: the acknowledgement. The test kills it after a random time and looks at what is
+there.
 """
 
 import json
@@ -19,7 +20,7 @@ import pytest
 
 from capture.session import Session, verify
 
-FRAMES = 40
+STEPS, CAMERAS = 20, 4
 
 NURSERY = """
 import json, logging, os, sys, traceback
@@ -30,12 +31,12 @@ import numpy as np
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, SubjectRecord
+from capture.session import NewFrame, Session, SubjectRecord
 
 logging.disable(logging.WARNING)
-RIG = load_rig("flash").resized(16)
-PLAN = Plan("flash", tuple(
-    Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(FRAMES)))
+NAMES = tuple(f"C{n:02d}" for n in range(CAMERAS))
+RIG = load_rig("dome").subset(lights=["L000"], views=NAMES).resized(16)
+PLAN = Plan("dome", tuple(Step(f"S{n:03d}", "dark", {}, {}, NAMES) for n in range(STEPS)))
 
 
 def write(path, acknowledged):
@@ -45,12 +46,16 @@ def write(path, acknowledged):
         session = Session.create(path, plan=PLAN, rig=RIG, devices={}, subject=SubjectRecord("P1"),
                                  source="simulated", session_id="killed")
     os.write(acknowledged, b"started ")
-    for step, camera in session.pending_frames():
-        values = np.full((96, 128), 600 + int(step.id[1:]), np.uint16)
+    done = {(record.step_id, record.camera): record.attempt for record in session.frames()}
+    for step in dict.fromkeys(step.id for step, _ in session.pending_frames()):
+        values = np.full((96, 128), 600 + int(step[1:]), np.uint16)
         blob = raw.encode_dng(values, pattern="RGGB", black=512, white=16383,
-                              step_id=step.id, session_id=session.id)
-        session.commit(step.id, camera, blob, settings={}, actual={}, t_host_s=0.0)
-        os.write(acknowledged, step.id.encode() + b" ")
+                              step_id=step, session_id=session.id)
+        session.commit_step(step, [
+            NewFrame(camera=name, blob=blob, settings={}, actual={}, t_host_s=0.0,
+                     attempt=done.get((step, name), 0) + 1)
+            for name in NAMES])
+        os.write(acknowledged, step.encode() + b" ")
     session.close()
     os.write(acknowledged, b"closed ")
 
@@ -80,7 +85,11 @@ class Nursery:
         os.mkfifo(self.fifo)
         single = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
         self.process = subprocess.Popen(
-            [sys.executable, "-c", NURSERY.replace("FRAMES", str(FRAMES))],
+            [
+                sys.executable,
+                "-c",
+                NURSERY.replace("STEPS", str(STEPS)).replace("CAMERAS", str(CAMERAS)),
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -124,12 +133,13 @@ def nursery(tmp_path):
     made.end()
 
 
-def frames_of(session):
-    """Return step -> whether its frame holds what the writer put into it."""
-    return {
-        record.step_id: set(np.unique(session.read(record).cfa)) == {600 + int(record.step_id[1:])}
-        for record in session.frames()
-    }
+def steps_of(session):
+    """Return step -> whether its frames have what the writer put into them, of whole steps."""
+    found = {}
+    for record in session.frames():
+        right = set(np.unique(session.read(record).cfa)) == {600 + int(record.step_id[1:])}
+        found.setdefault(record.step_id, []).append(right)
+    return {step: all(frames) for step, frames in found.items() if len(frames) == CAMERAS}
 
 
 @pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.long)])
@@ -156,7 +166,7 @@ def test_killed_writer_keeps_all_acknowledged_data(nursery, tmp_path, rng, kills
             assert not said
             continue
         session = Session.open(path)
-        right = frames_of(session)
+        right = steps_of(session)
         tally["lost"] += len(acknowledged - set(right))
         tally["corrupt"] += sum(not good for good in right.values())
         tally["damaged"] += not verify(path).ok
@@ -176,5 +186,5 @@ def test_killed_writer_keeps_all_acknowledged_data(nursery, tmp_path, rng, kills
         said, status = nursery.write(path)
         assert status == 0
         assert "closed" in said
-        assert all(frames_of(Session.open(path)).values())
+        assert all(steps_of(Session.open(path)).values())
         assert verify(path).ok

@@ -11,30 +11,13 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from fixtures.small_sessions import CAMERAS, DOME, commit_step, fill_of, plan_of
 
 from capture import raw
-from capture.plan import Plan, Step
-from capture.rig import load_rig
 from capture.session import Session, SessionError, SubjectRecord, verify
 from skinrig.soaking.storage import LoggedDisk, Medium, lay_out
 
-RIG = load_rig("flash").resized(16)
-
-
-def plan_of(frames):
-    return Plan(
-        "flash", tuple(Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(frames))
-    )
-
-
 SCAN = b"ply: a scan " * 7
-
-
-def commit(session, step_id):
-    values = np.full((10, 16), 600 + int(step_id[1:]), np.uint16)
-    words = {"pattern": "RGGB", "black": 512, "white": 16383}
-    blob = raw.encode_dng(values, **words, step_id=step_id, session_id=session.id)
-    session.commit(step_id, "cam", blob, settings={}, actual={}, t_host_s=0.0)
 
 
 # --- the log --------------------------------------------------------------------------------------
@@ -58,6 +41,20 @@ class NoAttachmentFolderSync(LoggedDisk):
 
 class NoJournalSync(LoggedDisk):
     left_out = "journal.jsonl"
+
+
+def write_at_once(log):
+    """Return the log as threads may make it: files of a step are created, written, then synced."""
+    order = ("create", "write", "sync")
+    step, found = [], []
+    for operation in [*log, ("end",)]:
+        if operation[0] in order:
+            step.append(operation)
+            continue
+        found += [one for kind in order for one in step if one[0] == kind]
+        found.append(operation)
+        step = []
+    return found[:-1]
 
 
 # --- the medium -----------------------------------------------------------------------------------
@@ -101,8 +98,8 @@ def judge(path, acknowledged, plan):
             return "lost"
         with session:
             found = outcome(session, frames, plan)
-            for step, _ in session.pending_frames():
-                commit(session, step.id)
+            for step_id in dict.fromkeys(step.id for step, _ in session.pending_frames()):
+                commit_step(session, step_id)
             if not session.attachments():
                 session.attach("scan.ply", SCAN)
             session.close()
@@ -112,8 +109,11 @@ def judge(path, acknowledged, plan):
 
 
 def outcome(session, frames, plan):
-    records = {record.step_id: record for record in session.frames()}
-    if not frames <= set(records) | set(session.attachments()):
+    records = {(record.step_id, record.camera): record for record in session.frames()}
+    whole = {
+        step.id for step in plan.steps if all((step.id, name) in records for name in step.cameras)
+    }
+    if not frames <= whole | set(session.attachments()):
         return "lost"
     for name in session.attachments():
         try:
@@ -121,9 +121,9 @@ def outcome(session, frames, plan):
                 return "corrupt"
         except SessionError:
             return "corrupt"
-    for step_id, record in records.items():
+    for place, record in records.items():
         try:
-            right = set(np.unique(session.read(record).cfa)) == {600 + int(step_id[1:])}
+            right = set(np.unique(session.read(record).cfa)) == {fill_of(*place)}
         except (SessionError, raw.RawError):
             right = False
         if not right:
@@ -133,15 +133,15 @@ def outcome(session, frames, plan):
 
 def create(path, plan, disk):
     words = {"devices": {}, "subject": SubjectRecord("P1"), "source": "simulated"}
-    return Session.create(path, plan=plan, rig=RIG, session_id="model", disk=disk, **words)
+    return Session.create(path, plan=plan, rig=DOME, session_id="model", disk=disk, **words)
 
 
 def record(root, disk, plan):
     """Capture a whole session on ``disk``, noting what was acknowledged and when."""
     session = create(root / "s", plan, disk)
     disk.note("acknowledged", "created")
-    for number, (step, _) in enumerate(session.pending_frames()):
-        commit(session, step.id)
+    for number, step in enumerate(plan.steps):
+        commit_step(session, step.id)
         disk.note("acknowledged", step.id)
         if number == 0:
             session.attach("scan.ply", SCAN)
@@ -151,10 +151,9 @@ def record(root, disk, plan):
     return disk.log
 
 
-def outcomes(tmp_path, disk_kind, frames):
+def outcomes(tmp_path, disk_kind, plan, reorder=list):
     (tmp_path / "real").mkdir()
-    plan = plan_of(frames)
-    log = record(tmp_path / "real", disk_kind(tmp_path / "real"), plan)
+    log = reorder(record(tmp_path / "real", disk_kind(tmp_path / "real"), plan))
     counts = Counter()
     for number, (image, acknowledged) in enumerate(crash_images(log)):
         root = tmp_path / f"{number}"
@@ -167,13 +166,24 @@ def outcomes(tmp_path, disk_kind, frames):
 
 @pytest.mark.parametrize("frames", [3, pytest.param(25, marks=pytest.mark.long, id="25 frames")])
 def test_power_cut_at_any_instant_keeps_acknowledged_data(tmp_path, frames):
-    counts = outcomes(tmp_path, LoggedDisk, frames)
+    counts = outcomes(tmp_path, LoggedDisk, plan_of(frames, 1))
     print(f"{sum(counts.values())} crash images: {dict(counts)}")
     assert set(counts) == {"ok"}
     assert counts["ok"] > 15 * frames
 
 
+@pytest.mark.parametrize("steps", [1, pytest.param(4, marks=pytest.mark.long, id="4 steps")])
+@pytest.mark.parametrize("reorder", [list, write_at_once])
+def test_power_cut_in_step_of_several_cameras(tmp_path, steps, reorder):
+    plan = plan_of(steps, len(CAMERAS))
+    counts = outcomes(tmp_path, LoggedDisk, plan, reorder)
+    print(f"{sum(counts.values())} crash images: {dict(counts)}")
+    assert set(counts) == {"ok"}
+    assert counts["ok"] > 10 * steps * len(CAMERAS)
+
+
 @pytest.mark.long
+@pytest.mark.parametrize("cameras", [1, len(CAMERAS)])
 @pytest.mark.parametrize(
     ("mutant", "crime"),
     [
@@ -184,15 +194,15 @@ def test_power_cut_at_any_instant_keeps_acknowledged_data(tmp_path, frames):
         (NoJournalSync, {"refused", "lost"}),
     ],
 )
-def test_omitted_sync_is_detected(tmp_path, mutant, crime):
-    counts = outcomes(tmp_path, mutant, 2)
+def test_omitted_sync_is_detected(tmp_path, mutant, crime, cameras):
+    counts = outcomes(tmp_path, mutant, plan_of(2, cameras))
     print(f"{mutant.__name__}: {dict(counts)}")
     assert crime & set(counts)
 
 
 def test_second_power_cut_while_resuming_keeps_acknowledged_data(tmp_path):
     """Cut the power at every instant of a capture, and again at every instant of the recovery."""
-    plan = plan_of(2)
+    plan = plan_of(2, 1)
     (tmp_path / "real").mkdir()
     log = record(tmp_path / "real", LoggedDisk(tmp_path / "real"), plan)
     counts = Counter()
@@ -217,17 +227,17 @@ def test_second_power_cut_while_resuming_keeps_acknowledged_data(tmp_path):
 
 def test_resuming_confirms_line_of_interrupted_process(tmp_path):
     """A process ended between its last line and that line's synchronization; another continues."""
-    plan, root = plan_of(2), tmp_path / "real"
+    plan, root = plan_of(2, 1), tmp_path / "real"
     root.mkdir()
     disk = LoggedDisk(root)
     session = create(root / "s", plan, disk)
     disk.note("acknowledged", "created")
     disk.left_out = "journal.jsonl"
-    commit(session, "S000")
+    commit_step(session, "S000")
     session.release()
     disk.left_out = LoggedDisk.left_out
     with Session.resume(root / "s", disk=disk) as resumed:
-        commit(resumed, "S001")
+        commit_step(resumed, "S001")
         disk.note("acknowledged", "S001")
     counts = Counter()
     for number, (image, acknowledged) in enumerate(crash_images(disk.log)):

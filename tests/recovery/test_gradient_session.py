@@ -105,7 +105,7 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
     made, tmp_path, monkeypatch, commits
 ):
     out = tmp_path / "session-cut"
-    honest, count = Session.commit, itertools.count(1)
+    honest, count = Session.commit_step, itertools.count(1)
 
     def commit(self, *args, **words):
         if next(count) > commits:
@@ -113,7 +113,7 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
         honest(self, *args, **words)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "commit", commit)
+        patch.setattr(Session, "commit_step", commit)
         with pytest.raises(Killed):
             simulate_session("gradient", out, **SMALL)
     assert len(Session.open(out).frames()) == commits

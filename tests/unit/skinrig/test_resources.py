@@ -327,14 +327,14 @@ def test_nearly_complete_session_resumes(tmp_path, free, monkeypatch):
     """Frames on the disk need no more room; a complete session needs none."""
     out = tmp_path / "s"
     order = {"target": "white", "width_px": 48}
-    commit, numbers = Session.commit, itertools.count()
+    commit, numbers = Session.commit_step, itertools.count()
 
     def commit_some(self, *args, **more):
         if next(numbers) == 4:
             raise KeyboardInterrupt
         return commit(self, *args, **more)
 
-    monkeypatch.setattr(Session, "commit", commit_some)
+    monkeypatch.setattr(Session, "commit_step", commit_some)
     with pytest.raises(KeyboardInterrupt):
         simulate_session("flash", out, **order)
     (out / "frames/more.bin").write_bytes(bytes(4_000_000))

@@ -5,8 +5,11 @@
 """
 
 import contextlib
+import errno
 import os
 import stat
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +17,9 @@ import pytest
 
 from capture import raw
 from capture.calibration import store as calibration_store
-from capture.session.disk import Disk, read_file
+from capture.session.disk import N_WRITERS, Disk, read_file
 from capture.session.errors import SessionDamage, SessionError
+from capture.session.folder import write_group
 
 
 @pytest.fixture
@@ -73,6 +77,37 @@ def test_calibration_and_its_name_are_on_disk(tmp_path, synced):
     calibration_store._write_atomically(tmp_path / "white.json", b"{}")
     file, folder = (tmp_path / "white.json").stat().st_ino, tmp_path.stat().st_ino
     assert synced == [("fsync", file), ("fsync", folder)]
+
+
+def test_files_of_step_are_synchronized_before_their_names(tmp_path, synced):
+    files = [tmp_path / f"{number}.dng" for number in range(9)]
+    write_group(Disk(), [(path, b"light") for path in files])
+    assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"light"}
+    inodes = {("fsync", path.stat().st_ino) for path in files}
+    assert (set(synced[:-1]), len(synced)) == (inodes, len(files) + 1)
+    assert synced[-1] == ("fsync", tmp_path.stat().st_ino)
+
+
+def test_work_is_done_by_several_threads_at_once():
+    together = threading.Barrier(N_WRITERS, timeout=10.0)
+    Disk().for_each(lambda _: together.wait(), range(2 * N_WRITERS))
+
+
+def test_error_of_work_begins_no_further_item():
+    """It is raised once no thread writes any more: the caller may then release the session."""
+    begun, ended = [], []
+
+    def work(number):
+        begun.append(number)
+        if number == 0:
+            raise OSError(errno.ENOSPC, "full")
+        time.sleep(0.02)
+        ended.append(number)
+
+    with pytest.raises(OSError, match="full"):
+        Disk().for_each(work, range(1000))
+    assert sorted(begun[1:]) == sorted(ended)
+    assert len(begun) < 1000
 
 
 def test_invalid_descriptor_is_refused(tmp_path):

@@ -7,7 +7,17 @@ is in its place, also those whose loss only another file system shows.
 import shutil
 
 import pytest
-from fixtures.small_sessions import PLAN, NotedDisk, commit_frame, commit_pending, create_session
+from fixtures.small_sessions import (
+    CAMERAS,
+    DOME,
+    PLAN,
+    NotedDisk,
+    commit_frame,
+    commit_pending,
+    commit_step,
+    create_session,
+    plan_of,
+)
 
 from capture.session import Session, SessionError, reopen_copy
 from capture.session.consent_seal import KEY_VARIABLE
@@ -74,6 +84,19 @@ def test_frame_is_durable_before_its_line(tmp_path, disk):
             *written("s/frames/S000+cam.dng.part"),
             *("rename s/frames/S000+cam.dng", "fsync_dir s/frames"),
             *line_written("s"),
+        ]
+
+
+def test_frames_of_step_share_flushes(tmp_path, disk):
+    plan = plan_of(1, len(CAMERAS))
+    files = [f"s/frames/S000+{camera}.dng" for camera in CAMERAS]
+    with create_session(tmp_path / "s", disk=disk, plan=plan, rig=DOME) as session:
+        disk.take_notes()
+        commit_step(session, "S000")
+        assert disk.take_notes() == [
+            *(one for file in files for one in written(f"{file}.part")),
+            *(f"rename {file}" for file in files),
+            *("fsync_dir s/frames", *line_written("s")),
         ]
 
 

@@ -5,7 +5,7 @@ import logging
 import os
 
 import pytest
-from fixtures.small_sessions import commit_frame, create_session
+from fixtures.small_sessions import CAMERAS, DOME, commit_frame, create_session, plan_of
 
 from capture.session import Session, SessionDamage, SessionDiskError, SessionError
 from capture.session.disk import Disk
@@ -164,6 +164,22 @@ def test_strays_of_equal_name_keep_their_content(tmp_path, caplog):
         for _ in range(2)
         for folder in ("attachments", "frames")
     ]
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_strays_of_one_step_are_set_aside(tmp_path, cameras):
+    """One interruption leaves the files of one step; of more, the journal has lost lines."""
+    create_session(tmp_path / "s", plan=plan_of(2, cameras), rig=DOME).release()
+    strays = [tmp_path / f"s/frames/S000+{camera}.dng" for camera in CAMERAS[:cameras]]
+    for stray in strays:
+        stray.write_bytes(b"x")
+    (tmp_path / "s/frames/S001+C00.dng").write_bytes(b"x")
+    with pytest.raises(SessionDamage, match=rf"got {cameras + 1} files .* at most {cameras}, "):
+        Session.resume(tmp_path / "s")
+    assert list((tmp_path / "s/orphans").iterdir()) == []
+    (tmp_path / "s/frames/S001+C00.dng").unlink()
+    Session.resume(tmp_path / "s").release()
+    assert len(list((tmp_path / "s/orphans").iterdir())) == cameras
 
 
 def test_several_strays_are_lost_lines(tmp_path):

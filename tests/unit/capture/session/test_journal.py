@@ -156,6 +156,39 @@ def test_zeros_after_last_line_are_torn(tail):
     assert (walk.end, walk.torn, walk.damage) == (len(first), len(tail), None)
 
 
+@pytest.mark.parametrize("kept", [0, 1, 2])
+@pytest.mark.parametrize("lost", ["hole", "end", "zeros"])
+def test_lines_of_one_write_are_torn(kept, lost):
+    """The lines before are whole, and their files are durable: they count."""
+    texts = seal_lines(*(OMITTED,) * 4)
+    start = sum(map(len, texts[: 1 + kept]))
+    whole = b"".join(texts)
+    data = {
+        "hole": whole[: start + 5] + bytes(len(texts[-1])) + whole[start + 5 + len(texts[-1]) :],
+        "end": whole[: start + 5],
+        "zeros": whole[: start + 5].ljust(len(whole), b"\0"),
+    }[lost]
+    walk = walk_journal(data, seal=SEAL, where="journal", max_group=3)
+    assert (len(walk.lines), walk.damage) == (1 + kept, None)
+    assert (walk.end, walk.torn) == (start, len(data) - start)
+
+
+@pytest.mark.parametrize("end", [b"", b'{"h"'])
+def test_hole_before_lines_of_later_writes_is_damage(end):
+    first, second, *later = seal_lines(*(OMITTED,) * 4)
+    data = first + second[:5] + bytes(9) + second[14:] + b"".join(later) + end
+    group = 2 + bool(end)
+    walk = walk_journal(data, seal=SEAL, where="journal", max_group=group)
+    assert walk.damage is not None
+    assert walk_journal(data, seal=SEAL, where="journal", max_group=group + 1).damage is None
+
+
+def test_flipped_bit_within_last_write_is_damage():
+    first, second, third = seal_lines(*(OMITTED,) * 3)
+    data = first + second.replace(b"omission", b"omissiom") + third
+    assert walk_journal(data, seal=SEAL, where="journal", max_group=3).damage is not None
+
+
 def test_spoiled_newline_is_damage():
     """The record is whole: a bit of the newline flipped after the line was durable."""
     first, last = seal_lines(OMITTED, OMITTED)

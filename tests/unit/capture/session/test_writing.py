@@ -1,21 +1,38 @@
 """Writing a session: what each call leaves in memory, on the disk, and in its error."""
 
+import errno
 import logging
 import math
+import os
+import time
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from fixtures.small_sessions import (
+    CAMERAS,
+    DOME,
     PLAN,
     NotedDisk,
     commit_frame,
     commit_pending,
+    commit_step,
     create_session,
     encode_frame,
+    plan_of,
 )
 
-from capture.session import Session, SessionDamage, SessionError, SessionLocked, reopen_copy, verify
+from capture.session import (
+    Disk,
+    NewFrame,
+    Session,
+    SessionDamage,
+    SessionDiskError,
+    SessionError,
+    SessionLocked,
+    reopen_copy,
+    verify,
+)
 from capture.session.reopening import resume_unless_complete
 
 
@@ -76,6 +93,126 @@ def test_foreign_camera_and_blob_are_refused(session):
     with pytest.raises(SessionError, match="names another step or session"):
         session.commit("S001", "cam", blob, **words)
     assert journal_of(session) == b""
+
+
+def test_frames_of_step_are_committed_in_order(tmp_path):
+    plan = plan_of(2, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        commit_step(session, "S001")
+        for opened in (session, Session.open(session.path)):
+            assert [(r.step_id, r.camera) for r in opened.frames()] == [
+                ("S001", camera) for camera in CAMERAS
+            ]
+            assert [one.id for one, _ in opened.pending_frames()] == ["S000"] * len(CAMERAS)
+        commit_step(session, "S000")
+        session.close()
+    report = verify(tmp_path / "s")
+    assert (report.ok, report.frames) == (True, 2 * len(CAMERAS))
+
+
+def test_refused_frame_leaves_no_file_of_others(tmp_path):
+    """Frames before it may be on the disk already, as each is written while the next is made."""
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        words = {"settings": {}, "actual": {}, "t_host_s": 0.0}
+        blob = encode_frame(session, "S000")
+        first, other, foreign = (
+            NewFrame(camera=camera, blob=blob, **words) for camera in ("C00", "C01", "C09")
+        )
+
+        def fail():
+            yield first
+            yield other
+            raise ZeroDivisionError("lost")
+
+        for frames, error, text in [
+            ([first, other, first], SessionError, "got 'C00', expected one frame of each camera"),
+            ([first, other, foreign], SessionError, "no such camera"),
+            (fail(), ZeroDivisionError, "lost"),
+        ]:
+            with pytest.raises(error, match=text):
+                session.commit_step("S000", frames)
+            assert journal_of(session) == b""
+            assert list((session.path / "frames").iterdir()) == []
+        session.commit_step("S000", [])
+        assert journal_of(session) == b""
+        commit_step(session, "S000")
+        session.close()
+    assert verify(tmp_path / "s").ok
+
+
+def test_file_that_was_there_before_is_kept(tmp_path):
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        stray = session.path / "frames/S000+C01.dng.part"
+        stray.write_bytes(b"of another program")
+        with pytest.raises(SessionDiskError, match="File exists"):
+            commit_step(session, "S000")
+        assert stray.read_bytes() == b"of another program"
+    with Session.resume(session.path) as again:
+        commit_step(again, "S000")
+        again.close()
+    orphans = {path.read_bytes() for path in (session.path / "orphans").iterdir()}
+    assert b"of another program" in orphans
+    assert verify(session.path).ok
+
+
+def test_frames_are_written_while_next_ones_are_made(tmp_path):
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+
+        def make():
+            for camera in CAMERAS:
+                blob = encode_frame(session, "S000")
+                yield NewFrame(camera=camera, blob=blob, settings={}, actual={}, t_host_s=0.0)
+                deadline_s = time.monotonic() + 10.0
+                part = session.path / f"frames/S000+{camera}.dng.part"
+                while not part.exists() or part.stat().st_size < len(blob):
+                    assert time.monotonic() < deadline_s
+                    time.sleep(0.001)
+
+        session.commit_step("S000", make())
+        assert len(session.frames()) == len(CAMERAS)
+
+
+class DiskFullAt(Disk):
+    """A disk without space for one file; the other ones are written by threads."""
+
+    def __init__(self, name):
+        self.name, self.refused = name, None
+
+    def create(self, path):
+        descriptor = super().create(path)
+        if self.name in path.name:
+            self.refused = descriptor
+        return descriptor
+
+    def write(self, descriptor, data):
+        if descriptor == self.refused:
+            super().write(descriptor, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        super().write(descriptor, data)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_full_disk_within_step_loses_no_committed_frame(tmp_path, camera):
+    disk = DiskFullAt(f"S001+{camera}")
+    plan = plan_of(3, len(CAMERAS))
+    session = create_session(tmp_path / "s", plan=plan, rig=DOME, disk=disk)
+    commit_step(session, "S000")
+    with pytest.raises(SessionDiskError, match="the disk refused: No space left") as caught:
+        commit_step(session, "S001")
+    assert "committed frames are safe" in str(caught.value)
+    with pytest.raises(SessionError, match="not open for writing"):
+        commit_step(session, "S002")
+    assert {r.step_id for r in Session.open(session.path).frames()} == {"S000"}
+    assert list((session.path / "frames").glob("S001*")) == []
+    with Session.resume(session.path) as again:
+        for step in ("S001", "S002"):
+            commit_step(again, step)
+        again.close()
+    report = verify(session.path)
+    assert (report.ok, report.frames) == (True, 3 * len(CAMERAS))
 
 
 @pytest.mark.parametrize("call", ["commit", "attach", "omit", "close"])

@@ -1,6 +1,9 @@
 """Domes that are simulated small, and their targets through the real drivers."""
 
+import dataclasses
 import itertools
+import math
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -13,7 +16,10 @@ from capture.rig import load_rig
 from capture.session import Session, verify
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.cli import main
-from skinrig.simulating import dome
+from skinrig.errors import UnusableError
+from skinrig.resources import forecast
+from skinrig.resources.free_memory import FreeMemory
+from skinrig.simulating import dome, driving
 from skinrig.simulating.dome import farthest_point_sample, small_dome
 from skinrig.simulating.orders import DomeOrder, SimulationError
 from skinrig.simulating.simulation import simulate_session
@@ -195,10 +201,49 @@ def test_scene_expects_lights_of_each_steps_cameras(monkeypatch, tmp_path):
         Step("T", "tracking", {}, {"leds": f"{b}+{c}"}, (left, right)),
     )
     expected, files = [], []
-    images = SimpleNamespace(render_ahead=lambda folder, most_bytes: files.append(folder))
+    images = SimpleNamespace(render_ahead=lambda *given: files.append(given))
     scene = SimpleNamespace(expect_requests=expected.extend, images=images)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**10))
     order = DomeOrder(out=tmp_path)
     dome._expect_images(scene, order, rig, Plan("dome", steps))
     twice = [(left, 1), (left, 2), (right, 1), (right, 2)]
     assert expected == [(left, 2), (right, 0), *twice]
-    assert files == [tmp_path.parent]
+    assert len(files) == 1
+    folder, most_bytes = files[0]
+    sizes = {view.name: view.width_px * view.height_px for view in rig.views}
+    assert folder == tmp_path.parent
+    assert most_bytes == pytest.approx(4 * (2 * sizes[left] + 3 * sizes[right]), abs=1)
+
+
+def test_images_ahead_are_forecast_without_being_required(monkeypatch, tmp_path):
+    """At full size, images of 150 lights take 13 GB until the end."""
+    enough = FreeMemory(math.inf, "machine", math.inf)
+    monkeypatch.setattr(forecast, "read_free_memory", lambda: enough)
+    space, lines = [10**12], []
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=space[0]))
+    order = DomeOrder(out=tmp_path / "s", progress=lines.append)
+    rig, plan = dome.plan_capture(dataclasses.replace(order, size="full"))
+    image_mb = 1e-6 * dome.count_image_bytes(order, rig, plan)
+    assert image_mb == pytest.approx(16 * 150 * 1.339 * 4, rel=1e-3)
+    session_mb = driving.forecast_rest(order, rig, plan, image_mb).disk_mb
+    for left_mb, text in [
+        (2.0 * image_mb + 1.0, "13 GB of temporary images until the end"),
+        (8000.0, "13 GB of temporary images until the end; 4 GB of these fit, other images are"),
+        (1000.0, "; 0.5 GB of these fit, other images are rendered more than once"),
+    ]:
+        space[0] = int(1e6 * (session_mb + left_mb)) + 1
+        driving.require_room(order, rig, plan, image_mb)
+        assert text in lines[-1]
+        assert lines[-1].endswith("until the end") == (left_mb > 2.0 * image_mb)
+        need = driving.forecast_rest(order, rig, plan, image_mb)
+        room_mb = forecast.temporary_room_mb(need, order.out)
+        assert room_mb == pytest.approx(min(image_mb, left_mb / 2.0), abs=1e-3)
+    space[0] = int(1e6 * session_mb) - 1
+    with pytest.raises(UnusableError, match="SR-CLI-017"):
+        driving.require_room(order, rig, plan, image_mb)
+
+
+@pytest.mark.parametrize("change", [{"target": "white"}, {"move": True}, {"size": "small"}])
+def test_images_that_memory_keeps_take_no_disk(change, tmp_path):
+    order = DomeOrder(out=tmp_path, **{"size": "full"} | change)
+    assert dome.count_image_bytes(order, *dome.plan_capture(order)) == 0

@@ -24,7 +24,7 @@ def image() -> np.ndarray:
 @pytest.fixture
 def interrupted(tmp_path, monkeypatch):
     """A session of four frames."""
-    commits, keep = itertools.count(), Session.commit
+    commits, keep = itertools.count(), Session.commit_step
 
     def commit(self, *args, **more):
         if next(commits) == 4:
@@ -32,7 +32,7 @@ def interrupted(tmp_path, monkeypatch):
         return keep(self, *args, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "commit", commit)
+        patch.setattr(Session, "commit_step", commit)
         with pytest.raises(Enough):
             simulate_session("flash", tmp_path / "s", target="white", width_px=48)
     return tmp_path / "s"

@@ -34,14 +34,14 @@ ASKED = {
 def commit_only(monkeypatch, count):
     """Have the session fail before the commit after `count` ones."""
     commits = itertools.count()
-    keep = Session.commit
+    keep = Session.commit_step
 
     def commit(self, *args, **more):
         if next(commits) == count:  # None: never
             raise Enough
         return keep(self, *args, **more)
 
-    monkeypatch.setattr(Session, "commit", commit)
+    monkeypatch.setattr(Session, "commit_step", commit)
 
 
 def read_files(folder):
@@ -101,6 +101,21 @@ def test_resumed_session_has_bytes_of_uninterrupted_session(
     # every image was stored before its frame was refused: none is computed again
     assert set(exposed.values()) == {1}
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.long
+def test_partly_recorded_step_resumes_same_bytes(tmp_path, monkeypatch, whole_files):
+    """A power cut may leave the lines of a step's first cameras alone."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1795000000")
+    with monkeypatch.context() as patch:
+        commit_only(patch, 3)
+        with pytest.raises(Enough):
+            simulate_session("dome", tmp_path / "parts", **ASKED["dome"])
+    journal = tmp_path / "parts/journal.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-1])
+    assert len(Session.open(tmp_path / "parts").frames()) == 3 * ASKED["dome"]["views"] - 1
+    simulate_session("dome", tmp_path / "parts", resume=True, **ASKED["dome"])
+    assert read_files(tmp_path / "parts") == whole_files("dome")
 
 
 @pytest.mark.long

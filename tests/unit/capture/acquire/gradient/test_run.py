@@ -370,14 +370,14 @@ class Killed(BaseException):
 
 def kill_at_commit(bench, number):
     """Make the host vanish before its n-th commit of this run."""
-    honest, count = bench.session.commit, itertools.count(1)
+    honest, count = bench.session.commit_step, itertools.count(1)
 
     def commit(*args, **words):
         if next(count) == number:
             raise Killed
         honest(*args, **words)
 
-    bench.session.commit = commit
+    bench.session.commit_step = commit
 
 
 @pytest.mark.long

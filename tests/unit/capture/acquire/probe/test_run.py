@@ -547,10 +547,10 @@ def kill_at(bench, owner, name, number):
 @pytest.mark.parametrize(
     ("owner", "name", "number"),
     [
-        ("session", "commit", 1),
-        ("session", "commit", 4),
-        ("session", "commit", 6),
-        ("session", "commit", 9),
+        ("session", "commit_step", 1),
+        ("session", "commit_step", 4),
+        ("session", "commit_step", 6),
+        ("session", "commit_step", 9),
         ("box", "open_shutter", 1),
         ("box", "open_shutter", 4),
         ("box", "open_shutter", 6),
@@ -587,7 +587,7 @@ def test_capture_resumes_after_any_interruption(make, owner, name, number):
 def test_a_series_of_two_placements_would_not_pass(make):
     """The check above can fail."""
     bench = make()
-    kill_at(bench, bench.session, "commit", 6)  # in the middle of the series' commits
+    kill_at(bench, bench.session, "commit_step", 6)  # in the middle of the series' commits
     with pytest.raises(Killed):
         bench.run(all_brackets=True)
     bench.resume()
