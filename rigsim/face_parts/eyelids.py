@@ -5,6 +5,7 @@ lids open along the rows of the head's regular grid: one row above the lid line 
 of the upper lid, the row below that of the lower lid, and the triangles between them are omitted.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -50,7 +51,7 @@ CANTHUS_DEPTH_MM: Final = (4.5, 2.0)
 CANTHUS_BLEND_MM: Final = 5.0
 _JOIN_MM: Final = 3.0
 """Difference in depth below which the lids' sphere and the corners' plane blend."""
-_REGION_MM: Final = ((4.0, 62.0), (0.0, 45.0), -45.0)
+REGION_MM: Final = ((4.0, 62.0), (0.0, 45.0), -45.0)
 """Range of x and y, and lowest z, of the vertices that open the eye."""
 
 
@@ -139,26 +140,26 @@ def _build_one(mesh: Mesh, shape: tuple[int, int], side: float) -> Eyelids:
     if side < 0.0:
         index = index[:, ::-1]
     at = points[index]
-    (x0, x1), (y0, y1), deep = _REGION_MM
+    (x0, x1), (y0, y1), deep = REGION_MM
     near = (at[..., 2] > deep) & (at[..., 0] > x0) & (at[..., 0] < x1)
     near &= (at[..., 1] > y0) & (at[..., 1] < y1)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     index, at, near = index[box], at[box], near[box]
     x, y = at[..., 0], at[..., 1]
-    first = np.argmax(y > _lid_line(x), axis=0)  # row of the upper margin, by column
+    first = np.argmax(y > lid_line(x), axis=0)  # row of the upper margin, by column
     column = np.arange(at.shape[1])
     inner, outer = FISSURE_MM
     across = x[first, column]
     opened = np.flatnonzero((across > inner) & (across < outer))
-    center = _place_eyeball(at, near)
+    center = place_eyeball(at, near)
     ends = at[first, column][[opened[0], opened[-1]]]
     ends[:, 2] -= CANTHUS_DEPTH_MM
     moved = _open(at, first, center, ends)
     moved = np.where(near[..., None], moved, at)
 
     lin = moved - at
-    middle = _arc_middle(at, moved, center)
+    middle = arc_middle(at, moved, center)
     arc = np.where(near[..., None], 4.0 * (middle - 0.5 * (at + moved)), 0.0)
     used = near & (np.abs(lin).max(axis=-1) > 1e-3)
     mirror = np.array([side, 1.0, 1.0])
@@ -210,12 +211,12 @@ def _between(
     return np.flatnonzero(mixed), np.concatenate(added)
 
 
-def _lid_line(x: Float64Array) -> Float64Array:
+def lid_line(x: Float64Array) -> Float64Array:
     """Return the height of the closed lids' line, as `rigsim.subject.head` draws it."""
     return np.asarray(17.2 + 0.011 * (x - 31.0) ** 2)
 
 
-def _place_eyeball(at: Float64Array, near: BoolArray) -> Float64Array:
+def place_eyeball(at: Float64Array, near: BoolArray) -> Float64Array:
     """Return the foremost center whose eye stays `CLEARANCE_MM` behind the closed lids."""
     center = np.array([EYE_X_MM, EYE_Y_MM, 0.0])
     off = at[near] - center
@@ -239,19 +240,64 @@ def _open(
         (~low, margins[0], UPPER_REACH_MM, OPENING_MM[0]),
         (low, margins[1], LOWER_REACH_MM, -OPENING_MM[1]),
     ):
-        change = _margin_height(margin[:, 0], opening) - margin[:, 1]
-        outside = np.maximum(FISSURE_MM[0] - margin[:, 0], margin[:, 0] - FISSURE_MM[1])
-        change *= np.exp(-((np.maximum(outside, 0.0) / CANTHUS_REACH_MM) ** 2))
-        away = np.abs(y - margin[None, :, 1]) / reach
-        moved[..., 1] = np.where(part, y + change[None, :] * _fade(away), moved[..., 1])
-        hugging = 1.0 - _smooth((away - 0.1) / 0.6)
-        hugging = hugging * np.exp(-((np.maximum(outside, 0.0) / CANTHUS_BLEND_MM) ** 2))[None, :]
+        height, hugging = _lift(y, margin, reach, opening)
+        moved[..., 1] = np.where(part, height, moved[..., 1])
         for j in column:
             rest_z = np.interp(moved[:, j, 1], y[:, j], at[:, j, 2])
             front = _lid_front(x[:, j], moved[:, j, 1], center, ends)
             z = rest_z + hugging[:, j] * (front - rest_z)
             moved[:, j, 2] = np.where(part[:, j], z, moved[:, j, 2])
     return moved
+
+
+def open_surface(
+    points: Float64Array,
+    upper: BoolArray,
+    center: Float64Array,
+    ends: Float64Array,
+    rest_z: Callable[[Float64Array, Float64Array], Float64Array],
+) -> Float64Array:
+    """Return the positions of points of any closed lids with the eye open, (N, 3).
+
+    Parameters
+    ----------
+    points
+        Skin around the right eye (x > 0), shape (N, 3), mm, frame of the mean head.
+    upper
+        Whether a point is above `lid_line`, shape (N,).
+    center, ends
+        Eyeball, shape (3,), and the open eye's inner and outer corner, shape (2, 3).
+    rest_z
+        Height z of the closed skin at x and y.
+    """
+    moved = points.copy()
+    for part, reach, opening in (
+        (upper, UPPER_REACH_MM, OPENING_MM[0]),
+        (~upper, LOWER_REACH_MM, -OPENING_MM[1]),
+    ):
+        x = points[part, 0]
+        margin = np.stack([x, lid_line(x)], axis=-1)
+        y, hugging = _lift(points[part, 1], margin, reach, opening)
+        rest = rest_z(x, y)
+        moved[part, 1] = y
+        moved[part, 2] = rest + hugging * (_lid_front(x, y, center, ends) - rest)
+    return moved
+
+
+def _lift(
+    y: Float64Array, margin: Float64Array, reach: float, opening: float
+) -> tuple[Float64Array, Float64Array]:
+    """Return the height of points with the eye open, and how closely they follow the eyeball.
+
+    The margins have x and y on their last axis; other axes broadcast with those of y.
+    """
+    change = _margin_height(margin[..., 0], opening) - margin[..., 1]
+    outside = np.maximum(FISSURE_MM[0] - margin[..., 0], margin[..., 0] - FISSURE_MM[1])
+    change *= np.exp(-((np.maximum(outside, 0.0) / CANTHUS_REACH_MM) ** 2))
+    away = np.abs(y - margin[..., 1]) / reach
+    hugging = 1.0 - _smooth((away - 0.1) / 0.6)
+    hugging = hugging * np.exp(-((np.maximum(outside, 0.0) / CANTHUS_BLEND_MM) ** 2))
+    return y + change * _fade(away), hugging
 
 
 def _margin_height(x: Float64Array, opening: float) -> Float64Array:
@@ -286,9 +332,7 @@ def _lid_front(
     return np.asarray(np.maximum(sphere, sheet) + 0.25 * _JOIN_MM * h * h)
 
 
-def _arc_middle(
-    start: Float64Array, end: Float64Array, center: Float64Array
-) -> NDArray[np.float64]:
+def arc_middle(start: Float64Array, end: Float64Array, center: Float64Array) -> NDArray[np.float64]:
     """Return the middle of the arcs around the eyeball from start to end, (..., 3)."""
     a, b = start - center, end - center
     ra = np.linalg.norm(a, axis=-1, keepdims=True)

@@ -91,27 +91,32 @@ class Hair:
         return np.asarray(eumelanin + self.pheomelanin * np.array(PHEOMELANIN_PER_RADIUS))
 
 
-def draw_hair(mesh: Mesh, preset: str, *, seed: int) -> Hair:
+def draw_hair(
+    mesh: Mesh, preset: str, *, seed: int, lids: tuple[Eyelids, Eyelids] | None = None
+) -> Hair:
     """Draw the hair of a person.
 
     Parameters
     ----------
     mesh
-        Head of `rigsim.subject.head.build_head` at rest, mm, rig frame.
+        Head at rest, mm, frame of the mean head.
     preset
         One of `rigsim.subject.PRESET_NAMES`; it sets the range of the melanins.
     seed
         Seed of the person, >= 0.
+    lids
+        Lids of both eyes on the mesh; None: those of the grid of
+        `rigsim.subject.head.build_head`.
 
     Raises
     ------
     rigsim.face_parts.eyelids.EyelidError
-        The mesh is another one.
+        Without lids, the mesh is another one.
     KeyError
         The preset is unknown.
     """
     rng = np.random.default_rng([seed, 40])
-    lids = build_eyelids(mesh)
+    lids = build_eyelids(mesh) if lids is None else lids
     eumelanin = rng.uniform(*_EUMELANIN[preset])
     pheomelanin = rng.uniform(*_PHEOMELANIN.get(preset, (0.05, 0.05)))
     iris = rng.uniform(*_IRIS_EUMELANIN.get(preset, (0.85, 1.0)))

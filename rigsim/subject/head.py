@@ -67,13 +67,13 @@ class _Groove:
     width_mm: float
 
 
-def build_head(rng: np.random.Generator, *, columns: int = 168, rows: int = 178) -> Mesh:
+def build_head(rng: np.random.Generator | None, *, columns: int = 168, rows: int = 178) -> Mesh:
     """Return a head mesh with a regular texture grid.
 
     Parameters
     ----------
     rng
-        Source of the shape's deviations from the mean.
+        Source of the shape's deviations from the mean; None: the mean head.
     columns, rows
         Quads along u and v; each yields two triangles.
 
@@ -110,9 +110,11 @@ def _rays(u: Float64Array, v: Float64Array) -> tuple[Float64Array, Float64Array]
     return start, way
 
 
-def _anatomy(rng: np.random.Generator) -> tuple[list[_Part], list[_Groove]]:
+def _anatomy(rng: np.random.Generator | None) -> tuple[list[_Part], list[_Groove]]:
     def s(scale: float = 1.0) -> float:
         """Draw a factor near 1, within two and a half standard deviations."""
+        if rng is None:
+            return 1.0
         return float(1.0 + scale * SHAPE_DEVIATION * np.clip(rng.standard_normal(), -2.5, 2.5))
 
     def ball(center: Point, radii: Point) -> _Solid:

@@ -37,8 +37,8 @@ def fuse(
         with fitted wrinkles.
     without
         What to leave out, separated by commas: rigs (flash, dome, gradient, probe), wrinkles, maps
-        (diffuse, r_d, normals, sigma_tr), or covariance. Its cost is printed: the maps are also
-        estimated with it.
+        (diffuse, r_d, normals, sigma_tr), covariance, or unmeasured (eyes, hair, crown and neck
+        for display). The cost of others is printed: the maps are also estimated with them.
     landmarks
         CSV table name,x,y,z in mm of the dome's mesh, or name,x,y in texels of its maps.
     image_landmarks
@@ -51,6 +51,8 @@ def fuse(
     from skinrig.fusing.double import FusionInputs, fuse, fuse_sources
     from skinrig.fusing.sources import read_sources
     from skinrig.fusing.summary import summarize
+    from skinrig.fusing.unmeasured import UNMEASURED_NAME
+    from skinrig.unmeasured.person import UNMEASURED_KEY
 
     console = Console(json)
     given = FusionInputs(
@@ -64,7 +66,7 @@ def fuse(
         [(one.rig, round(one.probability, 4), one.p_value) for one in found.all_checks],
     )
     cost = []
-    if given.without:
+    if set(given.without) - {UNMEASURED_NAME}:
         console.progress("once more, with what was left out")
         whole = fuse_sources(read_sources(given.paths), replace(given, without=()))
         cost = compare_without(whole.appearance, found.appearance)
@@ -74,6 +76,12 @@ def fuse(
         console.print_line(f"contradiction: {found.contradiction}")
     console.print_each("assumed", found.assumed)
     console.print_omissions(found.left_out)
+    added = found.appearance.parameters.get(UNMEASURED_KEY)
+    if isinstance(added, dict):
+        console.print_line(
+            f"not measured, for display: {', '.join(added['parts'])}; --without {UNMEASURED_NAME} "
+            "leaves them out"
+        )
     console.print_line(f"{out}: {', '.join(sorted(found.appearance.maps))}")
     console.print_line(f"next: skinrig report {shell_quote(out)}")
     console.print_document(
@@ -85,6 +93,7 @@ def fuse(
             "cost": cost,
             "fusion": found.appearance.parameters["fusion"],
             "contradiction": found.contradiction,
+            "unmeasured": added,
             "left_out": found.left_out,
         },
     )

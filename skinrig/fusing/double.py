@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +36,7 @@ from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
 from skinrig.fusing.sources import FusionInputError, Source, Sources, read_sources
 from skinrig.fusing.texel_colors import ColorSource, DomeColors, FlashColors
+from skinrig.fusing.unmeasured import UNMEASURED_NAME, add_unmeasured
 from skinrig.fusing.wrinkles import carry_wrinkles
 
 QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
@@ -50,6 +51,8 @@ FUSION_FILE: Final = "fusion.json"
 exports lack."""
 ALBEDO_MAP: Final = "r_d"
 COVARIANCE_NAME: Final = "covariance"
+NAMES_OF_NO_RIG: Final = (ALBEDO_MAP, COVARIANCE_NAME, UNMEASURED_NAME)
+"""What can be left out without leaving out a rig."""
 MAP_RIGS: Final[Mapping[str, str]] = {
     "diffuse": "flash",
     "sigma_tr": "probe",
@@ -67,8 +70,8 @@ class FusionInputs:
     paths
         Sessions with their maps next to them, or appearances, one per rig.
     without
-        Rigs, maps of `MAP_RIGS` or "covariance" to leave out. Without `r_d` the dome's mesh and
-        normals stay.
+        Rigs, maps of `MAP_RIGS`, "covariance" or "unmeasured" to leave out. Without `r_d` the
+        dome's mesh and normals stay; without "unmeasured" nothing is added for display.
     landmarks
         Table ``name,x,y,z`` in mm of the dome's mesh, or ``name,x,y`` in texels of its maps.
     image_landmarks
@@ -145,6 +148,11 @@ def fuse(
     if any(one.path.resolve() == out.resolve() for one in sources.by_rig.values()):
         raise FusionInputError(f"{out}: is one of the inputs; name another --out")
     found = fuse_sources(sources, given, progress=progress)
+    dome = sources.get("dome")
+    if dome is not None and not {UNMEASURED_NAME, "dome"} & set(given.without):
+        report = progress or (lambda _step: None)
+        whole = add_unmeasured(found.appearance, dome.path, given.landmarks, progress=report)
+        found = replace(found, appearance=whole)
     store.write(out, found.appearance)
     return found
 
@@ -169,7 +177,7 @@ def fuse_sources(
         If no colors are left.
     """
     report = progress or (lambda _step: None)
-    kept = [name for name in given.without if name not in (ALBEDO_MAP, COVARIANCE_NAME)]
+    kept = [name for name in given.without if name not in NAMES_OF_NO_RIG]
     sources = sources.without([MAP_RIGS.get(name, name) for name in kept])
     report("place texels")
     measured = measure(sources, given)

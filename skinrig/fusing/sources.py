@@ -91,7 +91,8 @@ class Sources:
             if name not in self.by_rig:
                 raise FusionInputError(
                     f"--without: got {name!r}, expected one of {', '.join(self.by_rig)}, their "
-                    "maps r_d, diffuse, sigma_tr, normals, or covariance; name a given one"
+                    "maps r_d, diffuse, sigma_tr, normals, covariance, or unmeasured; name a given "
+                    "one"
                 )
         return Sources({name: one for name, one in self.by_rig.items() if name not in rigs})
 

@@ -116,7 +116,7 @@ def close_holes(mesh: Mesh) -> ClosedMesh:
     open_mm: list[float] = []
     for patch in found:
         whole = np.concatenate([mesh.vertices_mm[patch.rim], patch.inner_mm])
-        place = _placed(taken, scale * np.sqrt(_area(whole, patch.faces) / np.pi))
+        place = place_disc(taken, scale * np.sqrt(_area(whole, patch.faces) / np.pi))
         if place is None:
             open_mm.append(patch.length_mm)
             continue
@@ -136,12 +136,24 @@ def _area(points: FloatArray, faces: NDArray[np.integer]) -> float:
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
-def _placed(taken: BoolArray, radius: float) -> tuple[Float64Array, float] | None:
-    """Return center and radius of the largest empty disc, reduced if necessary; None: no space."""
+def place_disc(
+    taken: BoolArray, radius: float, *, min_scale: float = MIN_RELATIVE_SCALE
+) -> tuple[Float64Array, float] | None:
+    """Return center and radius of the largest empty disc, reduced if necessary; None: no space.
+
+    Parameters
+    ----------
+    taken
+        Occupied cells of the texture, shape (`GRID_CELLS`, `GRID_CELLS`).
+    radius
+        Radius to place, texture units.
+    min_scale
+        Least radius to accept, over the one to place.
+    """
     far = ndimage.distance_transform_edt(np.pad(~taken, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(far)), far.shape)
     most = (float(far[row, column]) - 1.0) / GRID_CELLS - PATCH_MARGIN
-    if most < MIN_RELATIVE_SCALE * radius:
+    if most < min_scale * radius:
         return None
     center = np.array([(column + 0.5) / GRID_CELLS, 1.0 - (row + 0.5) / GRID_CELLS])
     return center, min(radius, most)

@@ -20,6 +20,7 @@ from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.unmeasured.person import HEAD_FILE, UNMEASURED_PARTS, DisplayedPerson, assemble_person
 from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
@@ -235,6 +236,7 @@ def build_scene(
     if size is None:
         size = PEOPLE_PX if people else FACE_PX
     whole, mesh_origin = _mesh(appearances, mesh)
+    parts = whole.parts if isinstance(whole, DisplayedPerson) else None
     kind: Kind = "procedural" if mesh is None else "mesh"
     if paths:
         first = next(iter(appearances.values())).seed
@@ -245,7 +247,7 @@ def build_scene(
     progress("fine skin")
     skin = FineSkin(subject, size)
     of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
-    source = SceneSource(kind, *of, landmarks, calibration, own_mesh=whole is not None)
+    source = SceneSource(kind, *of, landmarks, calibration, whole is not None, parts)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
         provenance |= {} if mesh is None else {"mesh": mesh.name}
@@ -327,7 +329,7 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
     return folders, appearances
 
 
-def _paint_patches(scene: ViewerScene, whole: ClosedMesh) -> ViewerScene:
+def _paint_patches(scene: ViewerScene, whole: ClosedMesh | DisplayedPerson) -> ViewerScene:
     textures = {
         name: replace(one, values=whole.paint(one.values)) if name in MEASURED_TEXTURES else one
         for name, one in scene.textures.items()
@@ -336,7 +338,10 @@ def _paint_patches(scene: ViewerScene, whole: ClosedMesh) -> ViewerScene:
 
 
 def _provenance(
-    source: SceneSource, paths: Sequence[Path], whole: ClosedMesh | None, mesh: str
+    source: SceneSource,
+    paths: Sequence[Path],
+    whole: ClosedMesh | DisplayedPerson | None,
+    mesh: str,
 ) -> dict[str, Any]:
     """Return the provenance of a captured scene, with the consent of its subjects."""
     found: dict[str, Any] = {
@@ -347,6 +352,8 @@ def _provenance(
     }
     if whole is not None and whole.charts:
         found["closed_holes"] = len(whole.charts)
+    if source.parts is not None:
+        found["not_measured"] = list(UNMEASURED_PARTS)
     agreed = consent.merge_consent(*source.appearances.values())
     return found | ({consent.CONSENT_KEY: consent.format_consent(agreed)} if agreed else {})
 
@@ -412,15 +419,20 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
 
 def _mesh(
     appearances: dict[str, SkinAppearance], path: Path | None
-) -> tuple[ClosedMesh | None, str]:
+) -> tuple[ClosedMesh | DisplayedPerson | None, str]:
     """Return the displayed mesh, None for the procedural head, and its description.
 
-    Holes of a scan are closed; those of another mesh may be intended.
+    Holes of a scan are closed; those of another mesh may be intended. A fused person has parts
+    that no rig measured, unless they were left out.
     """
     if path is not None:
         return ClosedMesh(load_mesh(path), (), ()), path.name
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH_FILE in appearance.files:
-            return close_holes(read_own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
+            closed, origin = close_holes(read_own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
+            if HEAD_FILE not in appearance.files:
+                return closed, origin
+            seed = appearance.seed if isinstance(appearance.seed, int) else 0
+            return assemble_person(appearance, closed, max(seed, 0)), origin
     return None, "the procedural head replaces the face"

@@ -19,6 +19,7 @@ from model.skin import SkinAppearance
 from rigsim.geometry.mesh import Mesh
 from rigsim.subject import SimulatedSubject
 from skinrig.arrays import Float32Array
+from skinrig.unmeasured.person import FaceParts
 from skinrig.viewer.fine_skin import FineSkin
 
 Storage = Literal["u8", "u16", "f16", "f32"]
@@ -125,6 +126,8 @@ class SceneSource:
         Folder with the color calibration of the dome's cameras.
     own_mesh
         Whether the mesh is a scan or a file, not the simulated head.
+    parts
+        Eyes and hair on this mesh, which were not measured; None: without.
     """
 
     kind: Kind
@@ -138,6 +141,7 @@ class SceneSource:
     landmarks: Path | None = None
     calibration: Path | None = None
     own_mesh: bool = False
+    parts: FaceParts | None = None
 
     @property
     def captured(self) -> bool:

@@ -27,6 +27,10 @@ EXPRESSION_OPENING: Final = {
 """Change of the lids' opening in each expression: action units 5, 6 and 7 of the facial action
 coding system (Ekman and Friesen 1978)."""
 
+SIMULATED_LABEL: Final = "Parts of the simulated head that are not skin."
+UNMEASURED_LABEL: Final = "Not measured: from a mean head, fitted to the scan."
+"""Descriptions of the parts on the page."""
+
 _IRIS_COLORS: Final = ((0.095, 0.14, 0.17), (0.10, 0.07, 0.032), (0.03, 0.015, 0.008))
 """Linear sRGB albedo of blue, hazel and dark brown irises."""
 _AZIMUTHAL_ROUGHNESS: Final = 0.3
@@ -34,17 +38,22 @@ _AZIMUTHAL_ROUGHNESS: Final = 0.3
 
 
 def build_assets(source: SceneSource) -> Assets:
-    """Build eyes behind lids that open, brows, lashes and hair of a simulated head.
+    """Build eyes behind lids that open, brows, lashes and hair.
 
-    A scan and the mesh of a file keep their own geometry and have none.
+    The simulated head has its own, a fused person those that were fitted to its scan. Other scans
+    and the mesh of a file have none.
     """
     rest = source.subject if source.subject.rest is None else source.subject.rest
-    if source.own_mesh or eyelids.grid_shape(source.mesh) is None:
+    if source.parts is not None:
+        both, hair, label = source.parts.lids, source.parts.hair, UNMEASURED_LABEL
+    elif source.own_mesh or eyelids.grid_shape(source.mesh) is None:
         return Assets(left_out=(("eyes and hair", "only the simulated head has them"),))
-    hair = draw_hair(source.mesh, rest.preset, seed=source.seed)
+    else:
+        both = eyelids.build_eyelids(source.mesh)
+        hair, label = draw_hair(source.mesh, rest.preset, seed=source.seed), SIMULATED_LABEL
     tables: dict[str, NDArray[Any]] = {}
     eyes = []
-    for name, lids in zip(("right", "left"), eyelids.build_eyelids(source.mesh), strict=True):
+    for name, lids in zip(("right", "left"), both, strict=True):
         moves = np.concatenate([lids.opening_mm, lids.arc_mm], axis=1)
         tables |= {
             f"lid_vertices_{name}": lids.vertices.astype(np.uint32)[:, None],
@@ -71,6 +80,7 @@ def build_assets(source: SceneSource) -> Assets:
         "width_mm": WIDTH_MM,
         **_describe_colors(hair),
         "eyes": eyes,
+        "label": label,
         "opening": EXPRESSION_OPENING,
         "sclera_radius_mm": eyelids.SCLERA_RADIUS_MM,
         "cornea_radius_mm": eyelids.CORNEA_RADIUS_MM,

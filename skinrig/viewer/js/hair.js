@@ -15,7 +15,7 @@ V.hairKey = p => [V.moveKey(p), p.brows, p.hair, V.cameraKey(p), p.heads, p.crow
 
 V.registerFaceParts = () => {
   const at = V.groups.findIndex(([id]) => id === "expression") + 1;
-  V.groups.splice(at, 0, ["parts", "Eyes and hair", "Parts of the simulated head that are not skin.", true]);
+  V.groups.splice(at, 0, ["parts", "Eyes and hair", V.scene.facts.face_parts.label, true]);
   V.controls.push(
     {group: "parts", kind: "range", path: ["eyes_open"], min: 0, max: 1, label: "Eyes open", show: V.percent,
       help: "Opening of the lids; expressions add to it. 0 %: closed."},
