@@ -125,9 +125,7 @@ def test_move_of_smooth_object_is_found(fault, seed, rig, tone, severity):
     assert 0.5 * severity < one.measured < 1.5 * severity
 
 
-@pytest.mark.parametrize(
-    "seed", [110524, *(pytest.param(n, marks=LONG) for n in (110677, 110683))]
-)
+@pytest.mark.parametrize("seed", [110524, *(pytest.param(n, marks=LONG) for n in (110677, 110683))])
 def test_relief_under_grazing_light_is_sound(seed):
     """Most of its samples are in cast shadow: an image there fits nothing, wherever it is."""
     tone = "light" if seed == 110524 else "medium"
