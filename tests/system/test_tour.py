@@ -39,7 +39,7 @@ def simulated(tmp_path_factory):
 @each_tutorial
 def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    # smaller than their defaults: how accurate maps of more pixels and lights are, other tests say
+    # smaller than their defaults, which other tests cover
     monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 256)
     monkeypatch.setitem(dome.WIDTHS_PX, "small", 200)
     monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 21)
