@@ -12,7 +12,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 RUNNER = """
 import ast, json, sys
 from skinrig.simulating import probe
-probe.TRUTH_PHOTONS["small"] = 4_000
+probe.TRUTH_PHOTONS["small"] = 15_000
 names = {}
 for cell in json.load(open(sys.argv[1]))["cells"]:
     if cell["cell_type"] == "code":
@@ -26,7 +26,7 @@ for cell in json.load(open(sys.argv[1]))["cells"]:
 """
 """What a kernel does: cells run in one namespace, and the value of a last expression is shown.
 
-A fifteenth of the probe's photons: other tests measure the accuracy of its sessions.
+A quarter of the probe's photons: other tests judge the accuracy of its sessions.
 """
 
 pytest.importorskip("xarray")
