@@ -27,6 +27,32 @@ def name_unit(file):
     return file
 
 
+REAL_TIME = frozenset({"faults", "firmware", "hardware", "protocol"})
+"""Folders of tests that wait for lines and emulated boards more than they compute."""
+
+
+def waits(unit):
+    """Return whether the tests of a unit mostly wait."""
+    return not REAL_TIME.isdisjoint(PurePosixPath(unit).parts[1:2])
+
+
+def choose_unit(waiting, busy_waiting):
+    """Return the position in the queue of the unit that a process gets.
+
+    One process at a time runs units that wait, as long as there are others: cores then have work
+    throughout, and the kernels and tables of a computing unit are loaded by fewer processes.
+
+    Parameters
+    ----------
+    waiting
+        Whether each unit of the queue waits.
+    busy_waiting
+        Whether another process has a unit that waits.
+    """
+    wanted = not busy_waiting
+    return waiting.index(wanted) if wanted in waiting else 0
+
+
 def pytest_xdist_make_scheduler(config, log):
     """Return a scheduler of units where files are asked for."""
     if config.getvalue("dist") != "loadfile":
@@ -40,7 +66,15 @@ def pytest_xdist_make_scheduler(config, log):
             return name_unit(super()._split_scope(nodeid))
 
         def _assign_work_unit(self, node):
-            name, unit = self.workqueue.popitem(last=False)
+            elsewhere = any(
+                waits(unit) and not all(tests.values())
+                for other, units in self.assigned_work.items()
+                if other is not node
+                for unit, tests in units.items()
+            )
+            names = list(self.workqueue)
+            name = names[choose_unit([waits(one) for one in names], elsewhere)]
+            unit = self.workqueue.pop(name)
             assigned = self.assigned_work.setdefault(node, {})
             for done in [one for one, tests in assigned.items() if all(tests.values())]:
                 del assigned[done]  # else each result counts all tests that went before

@@ -21,8 +21,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.decomposition import NMF
-from sklearn.exceptions import ConvergenceWarning
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
@@ -287,8 +285,7 @@ def reduce(
     total = scaled.sum()
     if total == 0.0:
         return np.zeros((len(shares), rank)), np.full((rank, shares.shape[1]), 1 / len(scale)), 0.0
-    model = NMF(rank, init="nndsvda", solver="cd", max_iter=400, tol=1e-3, random_state=seed)
-    found, mix = _factor(model, scaled / scaled.max())
+    found, mix = _factor(scaled / scaled.max(), rank, seed)
     mix = mix * scaled.max() / scale
     size = mix.sum(axis=1, keepdims=True)
     mix = np.where(size > 0.0, mix / np.where(size > 0.0, size, 1.0), 1.0 / len(scale))
@@ -301,7 +298,12 @@ def reduce(
     return found, mix, float(np.sqrt(max(squared[0], 0.0) / squared[1]))
 
 
-def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _factor(data: Float64Array, rank: int, seed: int) -> tuple[Float64Array, Float64Array]:
+    # imported here: most commands that load this module factor nothing, and it takes 0.4 s
+    from sklearn.decomposition import NMF
+    from sklearn.exceptions import ConvergenceWarning
+
+    model = NMF(rank, init="nndsvda", solver="cd", max_iter=400, tol=1e-3, random_state=seed)
     with warnings.catch_warnings():
         # A factorization stopped early is valid but slightly worse; its error includes that
         warnings.simplefilter("ignore", ConvergenceWarning)

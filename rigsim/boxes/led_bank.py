@@ -77,6 +77,7 @@ class LedBank:
         self._heat = np.full(self.count, faults.heat)
         self._hot = self._heat >= limits.thermal_trip
         self._heat_at = 0.0
+        self._due: float | None = None  # of `deadline`; None: heat or light have changed since
         self._dose_ws = np.zeros(self.count)
 
     # now --------------------------------------------------------------------------------------
@@ -103,6 +104,11 @@ class LedBank:
 
     def deadline(self) -> float:
         """Return when an LED goes off or its driver trips, in s; inf for never."""
+        if self._due is None:
+            self._due = self._find_due()
+        return self._due
+
+    def _find_due(self) -> float:
         due = math.inf
         trip, tau = self.limits.thermal_trip, self.limits.thermal_tau_s
         for led, (level, _, end_s) in self._lit.items():
@@ -135,6 +141,7 @@ class LedBank:
         fade = math.exp(-elapsed_s(self._heat_at, now) / self.limits.thermal_tau_s)
         self._heat = goal + (self._heat - goal) * fade
         self._heat_at = now
+        self._due = None
 
     # switching --------------------------------------------------------------------------------
 
@@ -154,6 +161,7 @@ class LedBank:
             return False
         self._heat_until(now)
         self._lit[led] = (level, now, end_s)
+        self._due = None
         return True
 
     def switch_off(self, led: int, now: float) -> None:
@@ -162,6 +170,7 @@ class LedBank:
             return
         self._heat_until(now)
         level, since, _ = self._lit.pop(led)
+        self._due = None
         if now <= since:
             return
         self._dose_ws[led] += self._power_w[led] * level * elapsed_s(since, now)

@@ -17,6 +17,7 @@ and specular reflections of lit skin, are omitted (a few percent of a few percen
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 from weakref import WeakValueDictionary
@@ -131,13 +132,19 @@ class Interreflection:
 
 
 _living: WeakValueDictionary[int, Interreflection] = WeakValueDictionary()
+_latest: deque[Interreflection] = deque(maxlen=2)
+"""The last exchanges: scenes of one face follow each other, and an exchange takes 0.8 s."""
+MAX_KEPT_PAIRS: Final = 4_000_000
+"""Pairs of patches, 8 bytes each, of an exchange that outlives its scene; a face has 2 million."""
 
 
 def interreflection_for(caster: Caster) -> Interreflection:
-    """Return the exchange on a mesh; the same as long as any caller holds it."""
+    """Return the exchange on a mesh: the same while it is held, and until two later ones exist."""
     found = _living.get(id(caster.mesh))  # the id stays unique while the exchange holds the mesh
     if found is None:
         found = _living[id(caster.mesh)] = Interreflection(caster)
+        if found.exchange.nnz <= MAX_KEPT_PAIRS:
+            _latest.append(found)
     return found
 
 

@@ -3,6 +3,7 @@
 Each question is asked of a fresh process, since this one has loaded everything already.
 """
 
+import ast
 import json
 import resource
 import subprocess
@@ -10,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from fixtures.product_code import PACKAGES, modules, tree_of
 
 ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("skinrig")
@@ -50,6 +52,17 @@ def packages(top):
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in sorted((ROOT / top).rglob("*.py"))
     ]
+
+
+def test_scikit_learn_is_loaded_by_functions_alone():
+    """To load it takes 0.4 s, and few commands that load its module factor a matrix."""
+    found = [
+        path.relative_to(ROOT).as_posix()
+        for path in modules(*PACKAGES)
+        for node in tree_of(path).body
+        if isinstance(node, ast.Import | ast.ImportFrom) and "sklearn" in ast.unparse(node)
+    ]
+    assert found == []
 
 
 @pytest.mark.parametrize("module", ["capture", "model", "reconstruction", "rigsim", "skinrig"])

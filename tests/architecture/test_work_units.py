@@ -1,5 +1,6 @@
 """Units of files for one process, and the reports that a process sends."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -74,6 +75,29 @@ def test_workers_run_each_test_once_in_units(tmp_path, work_units):
     assert sorted(number for node in nodes for number in node.asked) == list(range(6))
     folders = [{tests[number].split("/")[3] for number in node.asked} for node in nodes]
     assert sorted(map(sorted, folders)) == [["a"], ["b"]]
+
+
+@pytest.mark.parametrize(
+    ("waiting", "elsewhere", "position"),
+    [
+        ([False, True, True], False, 1),
+        ([False, True, True], True, 0),
+        ([True, True, False], True, 2),
+        ([True, True], True, 0),
+        ([False, False], False, 0),
+    ],
+)
+def test_one_process_at_a_time_waits(waiting, elsewhere, position, work_units):
+    assert work_units.choose_unit(waiting, elsewhere) == position
+
+
+def test_units_that_wait_are_known_by_folder(work_units):
+    assert work_units.waits("tests/protocol/test_port.py")
+    assert work_units.waits("tests/firmware/test_resets.py")
+    assert not work_units.waits("tests/unit/capture/devices")
+    assert not work_units.waits("model/skin.py")
+    folders = (Path(__file__).parents[1] / folder for folder in work_units.REAL_TIME)
+    assert all(folder.is_dir() for folder in folders)
 
 
 class Node:

@@ -19,6 +19,8 @@ HEAVY = {
     *("points 100 000 px away", "collapsed image", "incompressible tissue"),
     *("mirror up to 80 degrees", "scan of a ball", "texture of 8192 texels"),
     *("half of a face", "coarse scan", "scan turned and 100 m away"),
+    *("no overlap of the rigs", "colors outside skin", "surface without reflection"),
+    *("black pixels", "nearly forward scattering", "8K images", "rows of zeros"),
 }
 
 

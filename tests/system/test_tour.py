@@ -9,6 +9,7 @@ import pytest
 
 from skinrig.cli import main
 from skinrig.simulating import dome, flash_truth
+from skinrig.viewer import faces
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,11 +39,12 @@ def simulated(tmp_path_factory):
 @each_tutorial
 def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    # smaller than their defaults: how accurate maps of more pixels and lights are, other tests say
+    # smaller than their defaults, which other tests cover
     monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 256)
     monkeypatch.setitem(dome.WIDTHS_PX, "small", 200)
     monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 21)
     monkeypatch.setitem(dome.VIEW_COUNTS, "small", 5)
+    monkeypatch.setattr(faces, "FACE_PX", 256)
     lines = commands(page)
     assert lines
     for words in lines:

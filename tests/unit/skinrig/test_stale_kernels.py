@@ -9,6 +9,7 @@ SOURCES = {
     "model/part.py": "from numba import njit\n",
     "model/whole.py": "from model.part import loop\nfrom numba import njit\n",
     "model/other.py": "from numba import njit\n",
+    "model/most.py": "from numba import njit\nfrom model import (  # both\n    part as p,\n)\n",
 }
 
 
@@ -33,5 +34,5 @@ def test_kernels_newer_than_all_callees_are_kept(product):
 def test_changed_part_removes_own_and_caller_kernels(product):
     os.utime(product / "model" / "part.py", (3000, 3000))
     removed = {path.name.partition(".")[0] for path in remove_stale_kernels(product)}
-    assert removed == {"part", "whole"}
+    assert removed == {"part", "whole", "most"}
     assert len(list((product / "model" / "__pycache__").iterdir())) == 2

@@ -49,7 +49,7 @@ def test_leds_recover_oxygenation_of_monte_carlo_people(table):
 
 def test_colors_alone_leave_oxygenation_at_prior():
     """Rationale: three channels average over the bands of both hemoglobins."""
-    people = draw_people("published", (), PEOPLE)
+    people = draw_people("published", (), 5)  # any number proves it
     found = fit(signal_table(*CAMERA, ()), people.signals)
     assert not found.valid.any()
     assert found.stderr[:, 2].min() > 0.98 * OXYGENATION_SD

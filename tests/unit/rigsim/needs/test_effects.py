@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import weakref
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_tissue
 from rigsim.geometry.mesh import build_mesh
+from rigsim.light import interreflection
 from rigsim.light.interreflection import WAVELENGTH_STEPS
 from rigsim.light.lateral import scatter_laterally
 from rigsim.light.relief_shadow import hidden_sky_fraction
@@ -97,16 +100,41 @@ def test_edge_light_loss_matches_lateral_scattering(texels):
     assert lost != pytest.approx(effect_sizes.edge_loss([0.7], [[1.0]], 1.0)[0], rel=0.05)
 
 
-def test_interreflection_is_zero_on_plate_not_in_corner():
+@pytest.fixture
+def few_patches(monkeypatch):
+    """All patches of a corner see each other: with as many as of a face, 20 million pairs."""
+    made = partial(interreflection.Interreflection, patches=32)
+    monkeypatch.setattr(interreflection, "Interreflection", made)
+
+
+def corner():
+    return plate(SQUARE, (SQUARE[:, [2, 1, 0]] - [0.01, 0.0, 0.0])[::-1])
+
+
+def test_exchange_outlives_its_scene_until_two_later(few_patches):
+    mesh = corner().mesh
+    kept = weakref.ref(interreflection.interreflection_for(Caster(mesh)))
+    assert interreflection.interreflection_for(Caster(mesh)) is kept()
+    for _ in range(2):
+        assert kept() is not None
+        interreflection.interreflection_for(corner())
+    assert kept() is None
+
+
+def test_large_exchange_ends_with_its_scene(few_patches, monkeypatch):
+    monkeypatch.setattr(interreflection, "MAX_KEPT_PAIRS", 1000)
+    kept = weakref.ref(interreflection.interreflection_for(corner()))
+    assert kept() is None
+
+
+def test_interreflection_is_zero_on_plate_not_in_corner(few_patches):
     flat = plate(SQUARE)
     assert effect_sizes.is_flat(flat.mesh)
     assert effect_sizes.exchange_unless_flat(flat) is None
     assert effect_sizes.max_exchange_fraction(None) == 0.0
-    wall = SQUARE[:, [2, 1, 0]] - [0.01, 0.0, 0.0]
-    corner = plate(SQUARE, wall[::-1])
-    assert not effect_sizes.is_flat(corner.mesh)
+    assert not effect_sizes.is_flat(corner().mesh)
     # beside the edge a patch sees up to half a hemisphere of wall, through two boundaries
-    exchange = effect_sizes.exchange_unless_flat(corner)
+    exchange = effect_sizes.exchange_unless_flat(corner())
     assert 0.15 < effect_sizes.max_exchange_fraction(exchange) < 0.5
 
 

@@ -14,14 +14,18 @@ from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.subject.head import build_head
 from rigsim.subject.person import make_subject
 
-HEAD = build_head(np.random.default_rng(5))
 CLEAN = {"flaws": False, "clothes": False}
+
+
+@cache  # not when tests are read, which each process does
+def head():
+    return build_head(np.random.default_rng(5))
 
 
 @cache
 def scanned(seed=0, **changes):
     words = {"triangles": 12_000, "resolution_mm": 2.0} | changes
-    return scan_face(HEAD, rng=np.random.default_rng(seed), scanner=ScannerSettings(**words))
+    return scan_face(head(), rng=np.random.default_rng(seed), scanner=ScannerSettings(**words))
 
 
 def in_dome(scan, points=None):
@@ -29,8 +33,9 @@ def in_dome(scan, points=None):
     return points @ scan.to_dome[:3, :3].T + scan.to_dome[:3, 3]
 
 
-def heights(points, normals, mesh=HEAD):
+def heights(points, normals, mesh=None):
     """Return how far points lie above a mesh along their normals, mm; NaN beyond 6 mm."""
+    mesh = head() if mesh is None else mesh
     caster = Caster(mesh)
     best = np.full(len(points), np.nan)
     for sign in (1.0, -1.0):
@@ -56,7 +61,7 @@ def clean_surface(scan):
 @pytest.mark.long
 def test_same_seed_gives_same_bytes_another_seed_others():
     scanner = ScannerSettings(triangles=12_000, resolution_mm=2.0)
-    again = scan_face(HEAD, rng=np.random.default_rng(0), scanner=scanner)
+    again = scan_face(head(), rng=np.random.default_rng(0), scanner=scanner)
     assert again.ply == scanned().ply
     assert scanned(1).ply != scanned().ply
 
@@ -138,11 +143,11 @@ def test_area_hidden_from_camera_projector_pairs_is_hole():
     """Rays to the two projectors from points below the chin and beside the ears are barred."""
     scan = scanned(triangles=30_000, **CLEAN)
     mesh = trimesh.Trimesh(in_dome(scan), scan.faces, process=False)
-    near = trimesh.Trimesh(HEAD.vertices_mm, HEAD.faces, process=False)
+    near = trimesh.Trimesh(head().vertices_mm, head().faces, process=False)
     edges = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)[1]
     assert (edges == 1).sum() > 300  # its rim, and the rims of its holes
-    down = HEAD.normals[:, 1] < -0.9
-    front = HEAD.normals[:, 2] > 0.8
+    down = head().normals[:, 1] < -0.9
+    front = head().normals[:, 2] > 0.8
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(mesh.vertices).query(near.vertices)
@@ -162,7 +167,7 @@ def test_flawed_triangles_are_there_to_be_repaired():
     assert not welded.is_winding_consistent
     sizes = [len(part.faces) for part in welded.split(only_watertight=False)]
     assert sum(size < 50 for size in sizes) > 5  # islands
-    assert welded.bounds[0, 1] < HEAD.vertices_mm[:, 1].min() - 10  # the collar
+    assert welded.bounds[0, 1] < head().vertices_mm[:, 1].min() - 10  # the collar
 
 
 @pytest.mark.parametrize(("offset_mm", "offset_deg"), [(0.0, 0.0), (8.0, 3.0)])

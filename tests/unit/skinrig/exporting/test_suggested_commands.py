@@ -9,12 +9,14 @@ from model import store
 from skinrig.cli import main
 from skinrig.consent import parse_subject
 from skinrig.next_steps import suggest
+from skinrig.viewer import faces
 from skinrig.workspace import scan
 
 
 @pytest.mark.long
 def test_suggested_commands_run_to_their_end(patch, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(faces, "FACE_PX", 256)  # other tests build pages of 2048 texels
     consent = [parse_subject("none", None, None).to_json()]
     made = patch.face(source="measured", parameters={"consent": consent})
     store.write(tmp_path / "appearance", made)

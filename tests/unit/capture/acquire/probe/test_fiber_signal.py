@@ -1,5 +1,7 @@
 """Assessment of a series of exposures so far: enough, hopeless, or to be continued."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ SERIES_S = exposure_series_s(8, max_exposure_s=4.0, step_ev=1.0)
 EVERY = len(SERIES_S)
 
 
+@cache  # not when tests are read, which each process does
 def spots():
     """Return the number of the fiber that lights each pixel, 28 for none, shape (H, W)."""
     rows, columns = np.mgrid[: VIEW.height_px, : VIEW.width_px]
@@ -23,14 +26,11 @@ def spots():
     return found
 
 
-SPOTS = spots()
-
-
 def frame(rates, exposure_s, rng, *, dark_e=0.0, hot=0):
     """Return DN of spots with so many full scales per second, (28,), alike in all colors."""
-    electrons = dark_e * exposure_s + VIEW.full_well_e * exposure_s * np.append(rates, 0.0)[SPOTS]
+    electrons = dark_e * exposure_s + VIEW.full_well_e * exposure_s * np.append(rates, 0.0)[spots()]
     electrons = rng.poisson(np.minimum(electrons, 1e6)) + rng.normal(
-        0.0, VIEW.read_noise_e, SPOTS.shape
+        0.0, VIEW.read_noise_e, spots().shape
     )
     image = np.clip(np.round(VIEW.black_level + electrons / VIEW.gain_e_per_dn), 0, 4095)
     for number in range(hot):

@@ -163,16 +163,16 @@ def test_frames_of_other_light_levels_show_same_motion():
 
 
 @pytest.mark.parametrize(
-    ("session", "why"),
+    ("made", "why"),
     [
-        (Shots(times_s=()), "no tracking frame"),
-        (Shots(times_s=(3.0,)), "one tells no motion"),
-        (Shots(times_s=(0.0, 20.0), lacks=(1, RIG.views[0].name)), "one of two lacks a camera"),
+        ({"times_s": ()}, "no tracking frame"),
+        ({"times_s": (3.0,)}, "one tells no motion"),
+        ({"times_s": (0.0, 20.0), "lacks": (1, RIG.views[0].name)}, "one of two lacks a camera"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
-def test_fewer_than_two_full_frames_record_untracked_head(session, why):
-    assert follow(session) is None, why
+def test_fewer_than_two_full_frames_record_untracked_head(made, why):
+    assert follow(Shots(**made)) is None, why
 
 
 def test_images_outside_the_tracking_frames_are_not_used():
