@@ -19,6 +19,7 @@ from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.calibrating.gradient import GradientSurveys
 from skinrig.capturing.light_safety import light_rows
 from skinrig.evaluating import facial_color, flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
@@ -114,10 +115,10 @@ class RigDemo:
         """Simulate a capture into ``session-RIG-NAME``."""
         return simulate_session(rig, self.out / f"session-{rig}-{name}", seed=self.seed, **options)
 
-    def calibrate(self, rig: str, kind: str, *targets: str) -> None:
+    def calibrate(self, rig: str, kind: str, *targets: str, **options: Any) -> None:
         """Calibrate a rig from sessions of targets."""
         sessions = [self.out / f"session-{rig}-{target}" for target in targets]
-        calibrate(kind, sessions, self.out / f"calibration-{rig}")
+        calibrate(kind, sessions, self.out / f"calibration-{rig}", **options)
 
     def reconstruct(
         self,
@@ -255,8 +256,9 @@ def _gradient(run: RigDemo) -> None:
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
     with run.share("gradient: calibrate lights and polarizers"):
+        surveys: GradientSurveys = {}
         for kind in ("lights", "polarization"):
-            run.calibrate("gradient", kind, "ball")
+            run.calibrate("gradient", kind, "ball", surveys=surveys)
     with run.share("gradient: stretch and capture a patch of skin"):
         width = choose_width("gradient", run.width_px)
         capture = run.simulate("gradient", GRADIENT_SITE, site=GRADIENT_SITE, width_px=width)
