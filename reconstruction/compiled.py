@@ -18,6 +18,8 @@ PIXEL_KERNEL_OPTIONS: Final[dict[str, Any]] = {
     "error_model": "numpy",
 }
 """Options of a kernel that is called for all pixels."""
+BLOCK_KERNEL_OPTIONS: Final[dict[str, Any]] = PIXEL_KERNEL_OPTIONS | {"parallel": False}
+"""Options of a kernel that `model.threads.run_in_blocks` calls."""
 
 
 def readonly_array_type(dtype: types.Type, axes: int) -> types.Array:

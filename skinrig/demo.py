@@ -1,6 +1,7 @@
 """Run the demo: simulate, capture, calibrate, reconstruct, fuse, measure and report.
 
-The report is written when the first rig is done, and again after each further rig.
+The report is written when the first rig is done, and again after each further rig. Sections of
+earlier reports are reused.
 """
 
 import json
@@ -10,14 +11,14 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.stages import run_stages
@@ -31,6 +32,9 @@ from skinrig.resources.forecast import measure_folder_mb, require_resources_of_j
 from skinrig.simulating.simulation import list_tasks
 from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
+
+if TYPE_CHECKING:
+    from skinrig.reporting.drawn_sections import DrawnSections
 
 MAX_JOBS = 2
 """Rigs that run in parallel: much of each uses one core only, or waits for a compiler."""
@@ -49,8 +53,10 @@ BENCH_STAGES = (
 )
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
-TYPICAL_SECONDS = {"flash": 45.0, "dome": 110.0, "gradient": 60.0, "probe": 30.0}
-"""Seconds of each rig while another one runs, on two cores, in the order in which the rigs start.
+PERSON_PART = "person"
+"""Part of the demo after the rigs: their maps of the person are fused."""
+TYPICAL_SECONDS = {"flash": 45.0, "dome": 110.0, "gradient": 60.0, "probe": 30.0, PERSON_PART: 8.0}
+"""Seconds of each part while another one runs, on two cores, in the order in which they start.
 
 They lie between those with and without compiled kernels. The flash rig starts first: its maps are
 in the report while the other rigs run.
@@ -104,25 +110,24 @@ def run_demo(
     _make_room(out)
     began = time.perf_counter()
     parts: _Parts = {}
-    for rig, part in _run_rigs(asked, (out, seed, width_px, console), at_once):
-        parts[rig] = part
-        waiting = [one for one in asked if one not in parts]
+    wanted = [*asked, PERSON_PART] if _can_fuse(asked) else asked
+    write_report = partial(_write_report, out, drawn=_keep_sections())
+    for name, part in _run_parts(asked, (out, seed, width_px, console), at_once):
+        parts[name] = part
+        waiting = [one for one in wanted if one not in parts]
         if waiting:
-            _write_report(out, parts, _sum_up(asked, parts), preliminary=True)
+            write_report(parts, _sum_up(wanted, parts), waiting=waiting)
             console.print_line(
-                f"{rig}: done, {len(parts)} of {len(asked)} rigs, "
+                f"{name}: done, {len(parts)} of {len(asked)} rigs, "
                 f"about {_estimate_left_s(parts, waiting, at_once):.0f} s left; "
                 f"the report so far: {out / REPORT_NAME}"
             )
-    found, shares = _sum_up(asked, parts)
-    if {"flash", "dome"} <= set(asked):
-        run = RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found)
-        fuse_person(run, asked)
+    found, shares = _sum_up(wanted, parts)
     with _time_step("measure error against run time", shares, console):
         quiet = replace(console, quiet=True)  # the report shows its tables
         bench = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
     with _time_step("report", shares, console):
-        _write_report(out, parts, (found, shares), preliminary=False)
+        write_report(parts, (found, shares), waiting=())
     console.print_line("")
     console.print_table(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
@@ -171,20 +176,34 @@ _Part = tuple[DemoResults, SecondsByStep]
 _Parts = dict[str, _Part]
 
 
-def _sum_up(asked: Sequence[str], parts: _Parts) -> _Part:
-    """Return the results and seconds of the rigs that are done, in the order of the report."""
+def _sum_up(wanted: Sequence[str], parts: _Parts) -> _Part:
+    """Return the results and seconds of the parts that are done, in the order of the report."""
     found = DemoResults()
     shares: SecondsByStep = {}
-    for rig in asked:
-        if rig in parts:
-            found.errors += parts[rig][0].errors
-            found.tables += parts[rig][0].tables
-            shares |= parts[rig][1]
+    for name in wanted:
+        if name in parts:
+            found.errors += parts[name][0].errors
+            found.tables += parts[name][0].tables
+            shares |= parts[name][1]
     return found, shares
 
 
-def _write_report(out: Path, rigs: Iterable[str], results: _Part, *, preliminary: bool) -> None:
-    """Write the demo's document and its report on the rigs that are done."""
+def _keep_sections() -> "DrawnSections":
+    """Return an empty store of sections; reports are imported while the rigs run."""
+    from skinrig.reporting.drawn_sections import DrawnSections
+
+    return DrawnSections()
+
+
+def _write_report(
+    out: Path,
+    rigs: Iterable[str],
+    results: _Part,
+    *,
+    waiting: Sequence[str],
+    drawn: "DrawnSections",
+) -> None:
+    """Write the demo's document and its report on what is done; preliminary if parts wait."""
     from skinrig.reporting.report import build
 
     found, shares = results
@@ -198,11 +217,15 @@ def _write_report(out: Path, rigs: Iterable[str], results: _Part, *, preliminary
     done = set(rigs)  # the folders of the others are growing
     paths = [out]
     title = "skinrig demo"
-    if preliminary:
+    if waiting:
         paths = [one for one in sorted(out.iterdir()) if done & set(one.name.split("-"))]
         paths.append(written)
-        title += f": {', '.join(rig for rig in RIGS if rig in done)}; other rigs follow"
-    html = build(paths, title=title, reload_s=RELOAD_S if preliminary else None, folder=out)
+        follows = (
+            "the fused person follows" if set(waiting) == {PERSON_PART} else "other rigs follow"
+        )
+        title += f": {', '.join(rig for rig in RIGS if rig in done)}; {follows}"
+    reload_s = RELOAD_S if waiting else None
+    html = build(paths, title=title, reload_s=reload_s, folder=out, drawn=drawn)
     write_atomically(out / REPORT_NAME, html)
 
 
@@ -213,19 +236,30 @@ def _estimate_left_s(parts: _Parts, waiting: Sequence[str], at_once: int) -> flo
     return pace * sum(TYPICAL_SECONDS[rig] for rig in waiting) / at_once
 
 
-def _run_rigs(rigs: Sequence[str], order: _Order, at_once: int) -> Iterator[tuple[str, _Part]]:
-    """Yield each rig with its results when it is done."""
+def _can_fuse(rigs: Sequence[str]) -> bool:
+    """Return whether rigs have maps of one person that can be fused."""
+    return {"flash", "dome"} <= set(rigs)
+
+
+def _run_parts(rigs: Sequence[str], order: _Order, at_once: int) -> Iterator[tuple[str, _Part]]:
+    """Yield each rig with its results when it is done, then the fused person."""
     first = [rig for rig in TYPICAL_SECONDS if rig in rigs]
     if at_once > 1:
         yield from _run_in_processes(first, order, at_once)
-    else:
-        yield from ((rig, _run_rig(rig, *order)) for rig in first)
+        return
+    errors: list[list[Any]] = []
+    for rig in first:
+        part = _run_rig(rig, *order)
+        errors += part[0].errors
+        yield rig, part
+    if _can_fuse(rigs):
+        yield PERSON_PART, _fuse_rigs(rigs, errors, *order)
 
 
 def _run_in_processes(
     rigs: Sequence[str], order: _Order, at_once: int
 ) -> Iterator[tuple[str, _Part]]:
-    """Run each rig in its own process; an error in one stops all."""
+    """Run each rig in its own process, then the fusion; an error in one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
     )
@@ -234,8 +268,11 @@ def _run_in_processes(
         with _environment(PASSIVE_WAIT_SETTINGS), _delayed_signals():
             futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
             pool.submit(os.getpid)  # else the end of the process started last goes unnoticed
+        fusion = _Fusion(pool, futures, order) if _can_fuse(rigs) else None
         for done in as_completed(futures):
             yield futures[done], done.result()
+        if fusion is not None:
+            yield PERSON_PART, fusion.start().result()
     except BaseException as error:
         for process in multiprocessing.active_children():
             process.terminate()
@@ -248,6 +285,31 @@ def _run_in_processes(
         raise
     finally:
         pool.shutdown()
+
+
+class _Fusion:
+    """Fusion that begins when all rigs are done, while this process may still draw a report."""
+
+    def __init__(self, pool: Executor, rigs: Mapping[Future[_Part], str], order: _Order):
+        self._pool, self._rigs, self._order = pool, tuple(rigs), order
+        self._asked = tuple(rigs.values())
+        self._started: Future[_Part] | None = None
+        self._lock = threading.Lock()
+        for one in rigs:
+            one.add_done_callback(self._start_after_last)
+
+    def start(self) -> Future[_Part]:
+        """Return the running fusion; the first call starts it."""
+        with self._lock:
+            if self._started is None:
+                errors = [row for one in self._rigs for row in one.result()[0].errors]
+                self._started = self._pool.submit(_fuse_rigs, self._asked, errors, *self._order)
+            return self._started
+
+    def _start_after_last(self, _: Future[_Part]) -> None:
+        done = all(one.done() and not one.cancelled() for one in self._rigs)
+        if done and not any(one.exception() for one in self._rigs):
+            self.start()
 
 
 @contextmanager
@@ -303,12 +365,29 @@ def _end_with_parent() -> None:
 def _run_rig(
     rig: str, out: Path, seed: int, width_px: int | None, console: Console
 ) -> tuple[DemoResults, SecondsByStep]:
+    return _run_part(RIGS[rig], out, seed, width_px, console)
+
+
+def _run_part(
+    run_part: Callable[[RigDemo], None],
+    out: Path,
+    seed: int,
+    width_px: int | None,
+    console: Console,
+) -> _Part:
+    """Return the results and seconds of a part of the demo."""
     found = DemoResults()
     shares: SecondsByStep = {}
     with beat_while_running():
         timer = partial(_time_step, seconds=shares, console=console)
-        RIGS[rig](RigDemo(out, seed, timer, width_px, found))
+        run_part(RigDemo(out, seed, timer, width_px, found))
     return found, shares
+
+
+def _fuse_rigs(rigs: Sequence[str], errors: Sequence[list[Any]], *order: Any) -> _Part:
+    """Fuse the person's maps of rigs that are done, and show the errors that they found."""
+    in_order = [rig for rig in RIGS if rig in rigs]
+    return _run_part(lambda run: fuse_person(run, in_order, errors), *order)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.calibrating.gradient import GradientSurveys
 from skinrig.capturing.light_safety import light_rows
 from skinrig.evaluating import facial_color, flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
@@ -118,10 +119,10 @@ class RigDemo:
         """Simulate a capture into ``session-RIG-NAME``."""
         return simulate_session(rig, self.out / f"session-{rig}-{name}", seed=self.seed, **options)
 
-    def calibrate(self, rig: str, kind: str, *targets: str) -> None:
+    def calibrate(self, rig: str, kind: str, *targets: str, **options: Any) -> None:
         """Calibrate a rig from sessions of targets."""
         sessions = [self.out / f"session-{rig}-{target}" for target in targets]
-        calibrate(kind, sessions, self.out / f"calibration-{rig}")
+        calibrate(kind, sessions, self.out / f"calibration-{rig}", **options)
 
     def reconstruct(
         self,
@@ -259,8 +260,9 @@ def _gradient(run: RigDemo) -> None:
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
     with run.share("gradient: calibrate lights and polarizers"):
+        surveys: GradientSurveys = {}
         for kind in ("lights", "polarization"):
-            run.calibrate("gradient", kind, "ball")
+            run.calibrate("gradient", kind, "ball", surveys=surveys)
     with run.share("gradient: stretch and capture a patch of skin"):
         width = choose_width("gradient", run.width_px)
         capture = run.simulate("gradient", GRADIENT_SITE, site=GRADIENT_SITE, width_px=width)
@@ -305,8 +307,11 @@ def _probe(run: RigDemo) -> None:
     run.found.add_omissions("fiber probe", captures[-1])
 
 
-def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
-    """Fuse the maps of one person by these rigs, and compare them with the best single rig."""
+def fuse_person(run: RigDemo, rigs: Sequence[str], errors: Sequence[list[Any]] = ()) -> None:
+    """Fuse the maps of one person by these rigs, and compare them with the best single rig.
+
+    The finished face shows errors of the rigs' own maps, too.
+    """
     from skinrig.evaluating.fusion import compare_fused
     from skinrig.fusing.double import FusionInputs, fuse
     from skinrig.fusing.finished_face import render_finished_face, write_finished_face
@@ -338,14 +343,14 @@ def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
             run.out / FACE_FOLDER,
             face,
             double,
-            errors=_list_errors_shown(run.found),
+            errors=_list_errors_shown([*errors, *run.found.errors]),
             person=DOUBLE_FOLDER,
         )
 
 
-def _list_errors_shown(found: DemoResults) -> dict[str, str]:
+def _list_errors_shown(errors: Iterable[list[Any]]) -> dict[str, str]:
     """Return the errors of what the finished face shows, in words, by quantity."""
-    by_name = {(row[0], row[1]): row[2] for row in found.errors}
+    by_name = {(row[0], row[1]): row[2] for row in errors}
     r_d = [e for (name, what), e in by_name.items() if (name, what[:4]) == (DOUBLE_FOLDER, "r_d ")]
     shown = {}
     if r_d:

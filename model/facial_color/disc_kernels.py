@@ -3,7 +3,7 @@
 # mypy: allow-untyped-defs
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from model.facial_color.row_kernels import disc_row, square_row
 
@@ -278,9 +278,20 @@ def _tile(image, disc, trusted, box, room, found):
             deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+def count_tiles(rows: int, columns: int, tall: int, wide: int) -> int:
+    """Return the number of tiles of an image, all in pixels.
+
+    Examples
+    --------
+    >>> count_tiles(9, 4, 4, 4)
+    3
+    """
+    return -(-rows // tall) * -(-columns // wide)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def disc_moments(
-    h, valid, masked, half, high, inner, tall, wide, parts, trusted, mean, deviation, count
+    h, valid, masked, half, high, inner, tall, wide, trusted, mean, deviation, count, first, last
 ):
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
@@ -300,34 +311,32 @@ def disc_moments(
         Half-side of a square in the disc; no column farther out is taller than it.
     tall, wide : int
         Pixels of a tile.
-    parts : int
-        Runs of tiles, one per thread at a time.
     trusted : float
         Relative error of a variance that rounding may cause.
     mean, deviation : (H, W) float64, written
         NaN where no pixel of the disc counts.
     count : (H, W) int32, written
+    first, last : int
+        First tile, and the one after the last, of `count_tiles`.
     """
     rows, columns = h.shape
     reach, width = half.size - 1, half[0]
     across = (columns + wide - 1) // wide
-    down = (rows + tall - 1) // tall
     whole = np.int64(0)
     for a in range(reach + 1):
         whole += (2 * half[a] + 1) * (1 if a == 0 else 2)
     image, disc, found = (h, valid, masked), (half, high, inner, whole), (mean, deviation, count)
-    # buffers are reused within a part: allocating and clearing them per tile is slow
+    # buffers are reused: allocating and clearing them per tile is slow
     most_rows = min(rows, tall + 2 * reach)
     length = min(wide, columns) + 2 * width + 1
-    for part in prange(parts):
-        p = np.zeros(((most_rows + 3) // 4 * 4, length), h.dtype)
-        q = np.zeros((most_rows + 4, length), h.dtype)
-        nothing = np.zeros(length, h.dtype)
-        sums = np.empty((3, tall, wide), h.dtype)
-        v = np.empty((4, length))
-        down_columns, squares = np.empty(length), np.empty(wide)
-        for tile in range(part * across * down // parts, (part + 1) * across * down // parts):
-            y0, x0 = (tile // across) * tall, (tile % across) * wide
-            box = (y0, min(rows, y0 + tall), x0, min(columns, x0 + wide))
-            room = (p, q, nothing, sums, v, down_columns, squares)
-            _tile(image, disc, trusted, box, room, found)
+    p = np.zeros(((most_rows + 3) // 4 * 4, length), h.dtype)
+    q = np.zeros((most_rows + 4, length), h.dtype)
+    nothing = np.zeros(length, h.dtype)
+    sums = np.empty((3, tall, wide), h.dtype)
+    v = np.empty((4, length))
+    down_columns, squares = np.empty(length), np.empty(wide)
+    for tile in range(first, last):
+        y0, x0 = (tile // across) * tall, (tile % across) * wide
+        box = (y0, min(rows, y0 + tall), x0, min(columns, x0 + wide))
+        room = (p, q, nothing, sums, v, down_columns, squares)
+        _tile(image, disc, trusted, box, room, found)

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from model.checks import Checks
 from model.facial_color import disc_kernels
+from model.threads import run_in_blocks
 
 MAX_VARIANCE_ERROR: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
 """Relative error of a variance by running sums, by the type of the map, above which a disc is
@@ -141,18 +141,21 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     mean, deviation = np.empty(h.shape), np.empty(h.shape)
     count = np.empty(h.shape, np.int32)
     nothing = np.zeros((1, 1), np.bool_)
+    tall = 64 if radius_px <= 32.0 else 128
     for at in np.ndindex(h.shape[:-2]):
         mask = nothing if valid is None else np.ascontiguousarray(valid[at])
-        disc_kernels.disc_moments(
+        run_in_blocks(
+            disc_kernels.disc_moments,
+            disc_kernels.count_tiles(rows, columns, tall, _TILE_COLUMNS),
+            1,
             _read_only_view(np.ascontiguousarray(h[at])),
             _read_only_view(mask.view(np.uint8)),
             valid is not None,
             half,
             high,
             inner,
-            64 if radius_px <= 32.0 else 128,
+            tall,
             _TILE_COLUMNS,
-            4 * get_num_threads(),
             MAX_VARIANCE_ERROR[h.dtype],
             mean[at],
             deviation[at],

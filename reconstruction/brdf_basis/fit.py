@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
+from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import sample_kernels
@@ -208,7 +209,11 @@ def fit_weights(
     points = len(samples.value)
     weights = np.zeros((points, basis.size))
     given = (samples.value, samples.variance, samples.light_dir, samples.view_dir, samples.normals)
-    residual, stderr = fit_points(
+    residual, stderr = np.empty((2, points))
+    run_in_blocks(
+        fit_points,
+        points,
+        POINTS_PER_BLOCK,
         basis.table,
         basis.size,
         basis.cosine_similarity(),
@@ -217,6 +222,8 @@ def fit_weights(
         N_REWEIGHTINGS if compress == "cbrt" else 0,
         POINTS_PER_BLOCK,
         weights,
+        residual,
+        stderr,
     )
     return BasisWeights(weights, residual, stderr, np.isfinite(residual))
 

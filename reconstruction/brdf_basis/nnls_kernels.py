@@ -13,7 +13,7 @@ Lawson and Hanson 1974, Solving Least Squares Problems, chapter 23.
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, types
+from numba import boolean, float32, float64, int64, njit, types, void
 
 from reconstruction.brdf_basis.row_kernels import (
     FAST_MATH,
@@ -79,7 +79,7 @@ def _cholesky(gram, rhs, active, used, low, trial):  # type: ignore[no-untyped-d
 @njit(nogil=True)
 def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):  # type: ignore[no-untyped-def]
     """Minimize x' G x / 2 - rhs' x over x >= 0 by active sets, from the ``x`` given."""
-    used = 0
+    used = int64(0)
     for p in range(size):
         refused[p] = False
         if x[p] > 0.0:
@@ -259,7 +259,7 @@ def _update_weights(value, variance, model, count, weight, scatter):  # type: ig
 
 
 @njit(
-    types.UniTuple(types.Array(float64, 1, "C"), 2)(
+    void(
         types.Array(float32, 4, "C", readonly=True),
         int64,
         types.Array(float64, 2, "C", readonly=True),
@@ -272,9 +272,13 @@ def _update_weights(value, variance, model, count, weight, scatter):  # type: ig
         int64,
         int64,
         types.Array(float64, 2, "C"),
+        types.Array(float64, 1, "C"),
+        types.Array(float64, 1, "C"),
+        int64,
+        int64,
     ),
-    parallel=True,
     cache=True,
+    nogil=True,
 )
 def fit_points(  # type: ignore[no-untyped-def]
     table,
@@ -289,20 +293,22 @@ def fit_points(  # type: ignore[no-untyped-def]
     reweightings,
     block,
     weights,
+    rms,
+    stderr,
+    first,
+    last,
 ):
-    """Fit every point; fill ``weights`` (P, K), return weighted RMS residuals and standard errors.
+    """Fit points; fill ``weights`` (P, K), weighted RMS residuals and standard errors (P,).
 
     ``reweightings`` 0: weights from the variances alone (1 where a point has none); otherwise so
     many passes weight by noise and by cube roots. ``block`` points share their working memory, and
     start from each other's columns. The standard error is that of the lobe's scale, as a fraction
-    of it.
+    of it. ``first`` and ``last`` are a range of points, of whole blocks.
     """
-    points, samples = value.shape
+    samples = value.shape[1]
     lanes = table.shape[3]
     flat = table.reshape(-1)
-    rms = np.full(points, np.nan)
-    stderr = np.full(points, np.nan)
-    for chunk in prange((points + block - 1) // block):
+    for begin in range(first, last, block):
         rows = np.empty((samples, lanes), dtype=np.float32)  # the matrix
         cos_l = np.empty(samples)  # of the light
         picked = np.empty(samples, dtype=np.int64)  # the valid samples
@@ -328,9 +334,9 @@ def fit_points(  # type: ignore[no-untyped-def]
         trial = np.empty(MAX_ACTIVE_COLUMNS + 1)
         square = np.empty(lanes)
         pull = np.empty(lanes)
-        size = 0
-        for point in range(chunk * block, min((chunk + 1) * block, points)):
-            count = 0
+        size = int64(0)  # a literal would be a type of its own, and compile `_solve` again
+        for point in range(begin, min(begin + block, last)):
+            count = int64(0)
             known = True
             top = 0.0
             for i in range(samples):
@@ -342,6 +348,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                     top += float64(y[count]) * y[count]
                     count += 1
             weights[point, :] = 0.0
+            rms[point] = stderr[point] = np.nan
             if count == 0:
                 continue
             top /= count
@@ -358,7 +365,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                 fill_16(flat, cos_l, place, weight, count, rows, square)
             else:
                 fill_any(flat, cos_l, place, weight, count, rows, square)
-            kept = 0
+            kept = int64(0)
             for p in range(size):  # the neighbor's columns in use
                 if x[p] > 0.0:
                     working[kept] = working[p]
@@ -433,4 +440,3 @@ def fit_points(  # type: ignore[no-untyped-def]
             if power > 0.0:
                 noise = 1.0 if known or reweightings > 0 else misfit / count
                 stderr[point] = math.sqrt(noise / power)
-    return rms, stderr

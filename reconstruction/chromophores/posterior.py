@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from model.checks import Checks
 from model.color_table import ColorTable
+from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.common_optics import CommonOptics
@@ -166,7 +167,10 @@ def estimate(
     noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
     lines = equal_melanin_lines(table)
     maps = np.empty((len(ridge.POSTERIOR_MAPS), pixels), dtype=np.float32)
-    ridge.integrate_posteriors(
+    run_in_blocks(
+        ridge.integrate_posteriors,
+        pixels,
+        _TASK_PIXELS,
         np.ascontiguousarray(colors).reshape(-1, 3),
         np.ascontiguousarray(np.broadcast_to(noise, colors.shape), np.float32).reshape(-1, 3),
         usable.reshape(-1),
@@ -181,7 +185,6 @@ def estimate(
         prior.step,
         *_face_prior_costs(face, table),
         maps,
-        _TASK_PIXELS,
     )
     named = dict(zip(ridge.POSTERIOR_MAPS, maps.reshape(len(maps), *shape), strict=True))
     # the start fit used the mean model error, which is far too large in an image with much

@@ -1,4 +1,4 @@
-"""Integrate the posterior over all pairs of chromophores, one pixel at a time, in parallel.
+"""Integrate the posterior over all pairs of chromophores, one pixel at a time.
 
 For every melanin of a grid, the integration follows the best blood along the ridge of the
 likelihood, over the fold where dark skin takes the colors of lighter skin. Between the grid's lines
@@ -21,7 +21,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, void
+from numba import boolean, float32, float64, int64, njit, void
 
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.chromophores.ridge_kernels import (
@@ -40,7 +40,7 @@ from reconstruction.chromophores.ridge_kernels import (
 )
 from reconstruction.chromophores.start import N_LINES
 from reconstruction.chromophores.weight_kernels import quadratic_form
-from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
+from reconstruction.compiled import BLOCK_KERNEL_OPTIONS, FASTMATH_CONTRACT, readonly_array_type
 
 N_PROBES = 8
 """Positions between two lines at which the cost is first evaluated."""
@@ -316,9 +316,10 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
         ),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
         readonly_array_type(float64, 1),  # of blood: see blood_cost
         float32[:, ::1],  # maps (7, n): see POSTERIOR_MAPS
-        int64,  # pixels a task
+        int64,  # first pixel
+        int64,  # pixel after the last
     ),
-    **PIXEL_KERNEL_OPTIONS,
+    **BLOCK_KERNEL_OPTIONS,
 )
 def integrate_posteriors(  # type: ignore[no-untyped-def]
     rgb,
@@ -336,66 +337,57 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
     melanin_of_face,
     blood_of_face,
     maps,
-    block,
+    first,
+    last,
 ):
     """Integrate the posterior of every pixel; the shapes are in the signature above."""
-    pixels = rgb.shape[0]
     each_model = model.shape[0] > 1
     light = prior, prior_low, prior_step
-    for task in prange((pixels + block - 1) // block):
-        r = np.empty((9, N_LINES))
-        ridge = Ridge(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8])
-        cross_ridge = _CrossRidge(
-            np.empty((N_LINES, N_ACROSS)),
-            np.empty(N_LINES),
-            np.empty(N_LINES),
-            np.empty(N_LINES, dtype=np.bool_),
-            np.empty(N_COARSE),
+    r = np.empty((9, N_LINES))
+    ridge = Ridge(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8])
+    cross_ridge = _CrossRidge(
+        np.empty((N_LINES, N_ACROSS)),
+        np.empty(N_LINES),
+        np.empty(N_LINES),
+        np.empty(N_LINES, dtype=np.bool_),
+        np.empty(N_COARSE),
+    )
+    between = np.empty(N_LINES - 1)
+    edges_a, total_a = np.empty(_MAX_NODES + N_LINES), np.empty(_MAX_NODES + N_LINES)
+    edges_b, total_b = np.empty(N_BINS + 1), np.empty(N_BINS + 1)
+    bins = np.empty(N_BINS)
+    for n in range(first, last):
+        if not usable[n]:
+            for m in range(len(POSTERIOR_MAPS)):
+                maps[m, n] = np.nan
+            continue
+        d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
+        seen = math.log(d0), math.log(d1), math.log(d2)
+        w, s = color_weights(d0, d1, d2, variance[n], model[n if each_model else 0])
+        follow_ridge(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, start[n], ridge)
+        lowest, color_lowest = _min_ridge_cost(ridge, light, melanin_of_face, between)
+        b_low, b_high = _evaluate_across_ridge(
+            log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, cross_ridge
         )
-        between = np.empty(N_LINES - 1)
-        edges_a, total_a = np.empty(_MAX_NODES + N_LINES), np.empty(_MAX_NODES + N_LINES)
-        edges_b, total_b = np.empty(N_BINS + 1), np.empty(N_BINS + 1)
-        bins = np.empty(N_BINS)
-        for n in range(task * block, min(pixels, (task + 1) * block)):
-            if not usable[n]:
-                for m in range(len(POSTERIOR_MAPS)):
-                    maps[m, n] = np.nan
-                continue
-            d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
-            seen = math.log(d0), math.log(d1), math.log(d2)
-            w, s = color_weights(d0, d1, d2, variance[n], model[n if each_model else 0])
-            follow_ridge(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, start[n], ridge)
-            lowest, color_lowest = _min_ridge_cost(ridge, light, melanin_of_face, between)
-            b_low, b_high = _evaluate_across_ridge(
-                log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, cross_ridge
-            )
-            sums = edges_a, total_a, bins
-            blood_ends = b_low, b_high
-            count, mean_shade, square_shade, per_b = _integrate_ridge(
-                ridge,
-                cross_ridge,
-                between,
-                lowest,
-                light,
-                melanin_of_face,
-                ends[0],
-                blood_ends,
-                sums,
-            )
-            edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
-            for m in range(N_BINS):
-                edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
-                total_b[m + 1] = total_b[m] + bins[m]
-            if not total_a[count] > 0.0:  # the posterior is 0 along the whole ridge
-                for m in range(len(POSTERIOR_MAPS)):
-                    maps[m, n] = np.nan
-                continue
-            center, reach = _median_and_half_width(edges_a, total_a, count)
-            maps[0, n], maps[3, n] = center, reach
-            center, reach = _median_and_half_width(edges_b, total_b, N_BINS)
-            maps[1, n], maps[4, n] = center, reach
-            mean_shade /= total_a[count]
-            maps[2, n] = math.exp(mean_shade)
-            maps[5, n] = math.sqrt(color_lowest)
-            variance_shade = square_shade / total_a[count] - mean_shade * mean_shade
-            maps[6, n] = math.sqrt(max(variance_shade, 0.0))
+        sums = edges_a, total_a, bins
+        blood_ends = b_low, b_high
+        count, mean_shade, square_shade, per_b = _integrate_ridge(
+            ridge, cross_ridge, between, lowest, light, melanin_of_face, ends[0], blood_ends, sums
+        )
+        edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
+        for m in range(N_BINS):
+            edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
+            total_b[m + 1] = total_b[m] + bins[m]
+        if not total_a[count] > 0.0:  # the posterior is 0 along the whole ridge
+            for m in range(len(POSTERIOR_MAPS)):
+                maps[m, n] = np.nan
+            continue
+        center, reach = _median_and_half_width(edges_a, total_a, count)
+        maps[0, n], maps[3, n] = center, reach
+        center, reach = _median_and_half_width(edges_b, total_b, N_BINS)
+        maps[1, n], maps[4, n] = center, reach
+        mean_shade /= total_a[count]
+        maps[2, n] = math.exp(mean_shade)
+        maps[5, n] = math.sqrt(color_lowest)
+        variance_shade = square_shade / total_a[count] - mean_shade * mean_shade
+        maps[6, n] = math.sqrt(max(variance_shade, 0.0))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.checks import Checks
+from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.diffuse_albedo.kernels import MIN_FACTOR_COSINE, fit_envelope
 from reconstruction.lumitexels import boundary_kernels
@@ -27,6 +28,8 @@ Method = Literal["envelope", "stable_minimum", "minimum"]
 NORMAL_STDERR_RAD = np.deg2rad(1.0)
 GRAZING_COSINE = 0.3
 """Cosine to the horizon below which the stable minimum penalizes samples (73 degrees)."""
+_BLOCK_POINTS = 64
+"""Points that a thread fits at least."""
 DISCARD_FRACTION = 0.01
 """Fraction that the stable minimum discards if `discard` is None and noise is unknown."""
 
@@ -132,7 +135,10 @@ def estimate(
         start = _lower_quartile(ratio, usable)
         r_d, stderr = np.empty(start.shape), np.empty(start.shape)
         counts = np.zeros((len(start), 2), dtype=np.int64)
-        fit_envelope(
+        run_in_blocks(
+            fit_envelope,
+            len(start),
+            _BLOCK_POINTS,
             np.where(usable, samples.f, np.float32(0.0)),
             np.where(usable, samples.variance, np.float32(1.0)),
             samples.light,

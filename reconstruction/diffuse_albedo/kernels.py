@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, types, void
+from numba import boolean, float32, float64, int64, njit, types, void
 
 BECKMANN_ROUGHNESS = (0.13, 0.2, 0.3, 0.45)
 """Beckmann roughness of the lobes above the diffuse part; no tails."""
@@ -300,20 +300,36 @@ def _bounded(h, rhs, channels, free, low, b, x):  # type: ignore[no-untyped-def]
         types.Array(float64, 2, "C"),
         types.Array(float64, 2, "C"),
         types.Array(int64, 2, "C"),
+        int64,
+        int64,
     ),
-    parallel=True,
     cache=True,
+    nogil=True,
 )
 def fit_envelope(  # type: ignore[no-untyped-def]
-    f, variance, light, view, normal, valid, start, eta, tilt_rad, has_variance, r_d, stderr, counts
+    f,
+    variance,
+    light,
+    view,
+    normal,
+    valid,
+    start,
+    eta,
+    tilt_rad,
+    has_variance,
+    r_d,
+    stderr,
+    counts,
+    first,
+    last,
 ):
-    """Fill R_d (P, C), its standard error, and samples used and dropped (P, 2) of every point.
+    """Fill R_d (P, C), its standard error, and samples used and dropped (P, 2) of points.
 
     ``start`` is an initial R_d; ``tilt_rad`` the normals' standard error; ``has_variance`` whether
     the variances are known, rather than only their ratios.
     """
-    points, samples, channels = f.shape
-    for point in prange(points):
+    _, samples, channels = f.shape
+    for point in range(first, last):
         n = channels + _N_LOBES
         cosines = np.empty((3, samples))
         value = np.empty((channels, samples))

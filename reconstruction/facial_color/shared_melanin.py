@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from model.checks import Checks
 from model.color_table import ColorTable, with_exact_optics
+from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import (
     ChromophoreError,
@@ -315,8 +316,12 @@ class _BloodFit:
         of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         seen = self._seen.log_rgb, self._seen.relative, self.good, self._mean
-        maps = of_pixels, of_states, _TASK_PIXELS
-        kernels.fit_state_blood(*seen, log_change, stiffness, *self._fixed, self._reference, *maps)
+        run_in_blocks(
+            kernels.fit_state_blood,
+            pixels,
+            _TASK_PIXELS,
+            *(*seen, log_change, stiffness, *self._fixed, self._reference, of_pixels, of_states),
+        )
         return of_pixels, dict(zip(kernels.STATE_MAPS, of_states, strict=True))
 
 
@@ -394,7 +399,8 @@ def _mean_color(
     mean, variance = np.empty((2, *plain.shape), np.float32)
     given = seen.log_rgb, seen.relative, seen.usable, begin.astype(np.float32), owns
     cells = np.ascontiguousarray(table.cells, np.float64)
-    kernels.average_state_colors(*given, cells, mean, variance, _TASK_PIXELS)
+    written = mean, variance
+    run_in_blocks(kernels.average_state_colors, len(mean), _TASK_PIXELS, *given, cells, *written)
     return mean, variance
 
 

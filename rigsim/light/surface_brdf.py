@@ -41,7 +41,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit
 from numpy.typing import ArrayLike
 
 from rigsim import shading
@@ -50,7 +50,10 @@ from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_layers import ETA
+from rigsim.tissue.tissue_mc import run_in_threads
 
+_BLOCK_POINTS: Final = 4096
+"""Points that a thread evaluates at least."""
 HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
 """White-balanced reflectance of dark brown hair, modeled as a matt cover."""
 ETA_OIL: Final = 1.47
@@ -246,7 +249,14 @@ def evaluate_brdf(
     rows = count[0] if count else 1
     # copies: broadcast views are read-only, which is a different type for the compiler
     full = [np.array(np.broadcast_to(a, (rows, a.shape[-1])), order="C") for a in arrays]
-    return _evaluate(*full)
+    total, specular = np.zeros((rows, 3), np.float32), np.zeros(rows, np.float32)
+    edges = np.linspace(0, rows, max(rows // _BLOCK_POINTS, 1) + 1).astype(int)
+
+    def run(block: int) -> None:
+        _evaluate(*full, total, specular, edges[block], edges[block + 1])
+
+    run_in_threads(run, len(edges) - 1, get_num_threads())
+    return total, specular
 
 
 def min_surface_reflection(packed: ArrayLike, *, max_slope_deg: float = 70.0) -> Float32Array:
@@ -406,11 +416,10 @@ def _boundary(nl, nv):  # type: ignore[no-untyped-def]
     return two_way_transmittance(nl, nv)
 
 
-@njit(parallel=True, cache=True)
-def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
-    total = np.zeros((packed.shape[0], 3), np.float32)
-    specular = np.zeros(packed.shape[0], np.float32)
-    for i in prange(packed.shape[0]):
+@njit(cache=True, nogil=True)
+def _evaluate(packed, normal, light, camera, total, specular, first, last):  # type: ignore[no-untyped-def]
+    """Fill the total and the specular BRDF of points; both are 0 before."""
+    for i in range(first, last):
         nl = nv = squared = 0.0
         for k in range(3):
             nl += float(normal[i, k]) * light[i, k]
@@ -433,4 +442,3 @@ def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
         specular[i] = surface
         for k in range(3):
             total[i, k] = inside * packed[i, k] + surface
-    return total, specular

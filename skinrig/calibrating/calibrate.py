@@ -50,6 +50,7 @@ def calibrate(
     created: date | None = None,
     targets: dome.DomeTargets | None = None,
     phantom: str | Path | None = None,
+    surveys: gradient.GradientSurveys | None = None,
 ) -> SavedCalibration:
     """Estimate one kind of calibration from target sessions and save it.
 
@@ -70,6 +71,8 @@ def calibrate(
     phantom
         Certificate of the phantom that a probe's "fiber" was measured on; None: that of the
         simulated phantom, for simulated sessions only.
+    surveys
+        Of a gradient sphere: see `skinrig.calibrating.gradient.calibrate_gradient`.
 
     Raises
     ------
@@ -90,7 +93,7 @@ def calibrate(
         paper = None if phantom is None else read_certificate(phantom)
         made = probe.calibrate_probe(given, certificate=paper)
     elif gradient.has_gradient_session(opened):
-        made = gradient.calibrate_gradient(kind, given)
+        made = gradient.calibrate_gradient(kind, given, surveys)
     elif kind in dome.DOME_CALIBRATION_KINDS:
         made = dome.calibrate_dome(kind, given, targets=targets)
     else:

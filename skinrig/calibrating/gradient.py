@@ -21,6 +21,8 @@ from skinrig.calibrating.outcome import (
 )
 
 GRADIENT_CALIBRATION_KINDS = ("sensor", "lights", "polarization")
+GradientSurveys = dict[tuple[str, ...], tuple[SphereSurvey, tuple[str, ...]]]
+"""Surveys and their notes by the content hashes of the ball's sessions."""
 ANALYZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyzer, degrees, in each of its named settings."""
 
@@ -30,7 +32,9 @@ def has_gradient_session(sessions: Sequence[Session]) -> bool:
     return any("gradient_sphere" in session.rig.boxes for session in sessions)
 
 
-def calibrate_gradient(kind: str, sessions: TargetSessions) -> CalibrationResult:
+def calibrate_gradient(
+    kind: str, sessions: TargetSessions, surveys: GradientSurveys | None = None
+) -> CalibrationResult:
     """Estimate the calibration "sensor", "lights" or "polarization" of a gradient sphere.
 
     Parameters
@@ -40,6 +44,9 @@ def calibrate_gradient(kind: str, sessions: TargetSessions) -> CalibrationResult
     sessions
         For "sensor", sessions of the flat field; otherwise one session of the black glass ball.
         Light intensities are corrected by the flat field of the folder's sensor calibration.
+    surveys
+        Surveys of earlier calls with the same sensor calibration; a new one is added. "lights" and
+        "polarization" are results of one survey.
 
     Raises
     ------
@@ -59,7 +66,11 @@ def calibrate_gradient(kind: str, sessions: TargetSessions) -> CalibrationResult
         raise CalibratingError(f"kind: got {kind!r}, expected {known} for rig {rigs.pop()!r}")
     if kind == "sensor":
         return _sensor(sessions)
-    survey, notes = _survey(sessions)
+    surveys = {} if surveys is None else surveys
+    contents = tuple(session.content_hash for session in sessions.sessions)
+    if contents not in surveys:
+        surveys[contents] = _survey(sessions)
+    survey, notes = surveys[contents]
     findings = (*survey.findings, *notes)
     about = {"notes": number_findings(findings), **sessions.provenance()}
     if kind == "lights":

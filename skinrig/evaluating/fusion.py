@@ -193,9 +193,15 @@ def _match(
     """Return texels with ground truth, (N,), and its values there, (N, C)."""
     usable = known & intersect_valid(true_position)
     tree = cKDTree(true_position.values[usable])
-    distance, index = tree.query(position.values.reshape(-1, 3), workers=1)
-    near = position.mask.reshape(-1) & (distance < MAX_MATCH_DISTANCE_MM)
-    return near, values[usable][index].astype(np.float64)
+    near = position.mask.reshape(-1).copy()
+    # without the bound, the search for points far from the face visits most of the tree
+    bound = {"distance_upper_bound": MAX_MATCH_DISTANCE_MM}
+    distance, index = tree.query(position.values.reshape(-1, 3)[near], workers=1, **bound)
+    found = distance < MAX_MATCH_DISTANCE_MM
+    near[near] = found
+    true = np.zeros((near.size, values.shape[-1]))
+    true[near] = values[usable][index[found]]
+    return near, true
 
 
 def _row(

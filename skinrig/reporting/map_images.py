@@ -139,7 +139,8 @@ def draw_plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Im
 
 
 def _address(image: UInt8Array, lossy: bool = False) -> str:
-    return png.encode_jpeg_url(image) if lossy else png.to_webp_url(png.encode(image))
+    # the PNG file is only an intermediate
+    return png.encode_jpeg_url(image) if lossy else png.to_webp_url(png.encode(image, quick=True))
 
 
 def _build_image(

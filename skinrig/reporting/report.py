@@ -1,20 +1,22 @@
 """Build a self-contained HTML page of measurements and their errors against ground truth."""
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import is_fused
+from skinrig.appearances.contents import hash_file, is_fused
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.evaluating.session_agreement import SessionAgreement
 from skinrig.reporting import first_screen, map_images, page, provenance, repeating
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
+from skinrig.reporting.drawn_sections import DrawnSections
 from skinrig.reporting.folders import ReportError, ReportInputs, discover, read_json
 from skinrig.reporting.map_names import map_title
 from skinrig.reporting.sections import (
@@ -60,6 +62,7 @@ def build(
     title: str = "skinrig report",
     reload_s: int | None = None,
     folder: Path | None = None,
+    drawn: DrawnSections | None = None,
 ) -> str:
     """Return a deterministic HTML report of everything at ``paths``.
 
@@ -74,13 +77,18 @@ def build(
         Seconds after which a browser loads the page again; None: never.
     folder
         Folder in which the page will be, for links to files there; None: without links.
+    drawn
+        Sections of earlier reports; those of unchanged maps are reused, new ones are added.
 
     Raises
     ------
     ReportError
         If a path does not exist, or nothing is found.
     """
-    return build_any(paths, title=title, compare=False, reload_s=reload_s, folder=folder).html
+    report = build_any(
+        paths, title=title, compare=False, reload_s=reload_s, folder=folder, drawn=drawn
+    )
+    return report.html
 
 
 def build_any(
@@ -90,6 +98,7 @@ def build_any(
     compare: bool | None = None,
     reload_s: int | None = None,
     folder: Path | None = None,
+    drawn: DrawnSections | None = None,
 ) -> Report:
     """Return the report on a collection, or the comparison of two runs.
 
@@ -101,10 +110,8 @@ def build_any(
         Heading of the page.
     compare
         Whether two runs are compared; None: by the rule of `run_comparison.split_sides`.
-    reload_s
-        As for `build`; a comparison is never loaded again.
-    folder
-        As for `build`.
+    reload_s, folder, drawn
+        As for `build`; a comparison is never loaded again, and none of it is reused.
 
     Raises
     ------
@@ -126,17 +133,20 @@ def build_any(
         return Report(html, checks, (both[0].label, both[1].label), verdicts)
     checks_of_all: list[page.Check] = []
     found = discover(places)
-    body = build_sections(found, checks_of_all, folder)
+    appearances = _read_appearances(found)
+    body = _build_sections(found, appearances, checks_of_all, folder, drawn)
+    first = _first_screen(found, appearances)
     lead = verdict_section.section(
-        checks_of_all, found.summary(), _list_least_certain(found), _first_screen(found)
+        checks_of_all, found.summary(), _list_least_certain(found), first
     )
     html = page.render_page(title, lead, body, reload_s=reload_s)
     return Report(html, tuple(checks_of_all), None)
 
 
-def _first_screen(found: ReportInputs) -> Iterator[page.Block]:
+def _first_screen(
+    found: ReportInputs, appearances: Mapping[str, SkinAppearance]
+) -> Iterator[page.Block]:
     """Yield the images of the first screen."""
-    appearances = _read_appearances(found)
     truths = {name: found.find_truth(appearance) for name, appearance in appearances.items()}
     yield from first_screen.draw_first_screen(appearances, truths)
 
@@ -179,24 +189,17 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
         deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
 
-def build_sections(
-    found: ReportInputs, checks: list[page.Check], folder: Path | None = None
+def _build_sections(
+    found: ReportInputs,
+    appearances: Mapping[str, SkinAppearance],
+    checks: list[page.Check],
+    folder: Path | None,
+    drawn: DrawnSections | None,
 ) -> list[page.Block]:
-    """Return the sections of a report, and add its checks.
-
-    Parameters
-    ----------
-    found
-        Contents of the paths of a report.
-    checks
-        Checks are added to it.
-    folder
-        Folder in which the page will be; None: unknown.
-    """
-    appearances = _read_appearances(found)
+    """Return the sections of a report, and add its checks."""
     sessions = session.read_session_facts(found.sessions)
     return [
-        *_maps(found, appearances, checks),
+        *_maps(found, appearances, checks, drawn),
         *(
             block
             for number, face in enumerate(found.faces)
@@ -213,19 +216,41 @@ def build_sections(
 
 
 def _maps(
-    found: ReportInputs, appearances: Mapping[str, SkinAppearance], checks: list[page.Check]
+    found: ReportInputs,
+    appearances: Mapping[str, SkinAppearance],
+    checks: list[page.Check],
+    drawn: DrawnSections | None = None,
 ) -> Iterator[page.Block]:
+    drawn = DrawnSections() if drawn is None else drawn
     for name, appearance in appearances.items():
         if dynamic.is_dynamic(appearance):
-            subject = page.ReportedAppearance(name, appearance, None, checks)
-            yield from _dynamic_section(subject, found)
+            again = ""
+            draw = partial(_dynamic_section, found=found)
         else:
-            truth = found.find_truth(appearance)
             again = repeating.repeat_maps(name, appearance, found)
-            subject = page.ReportedAppearance(name, appearance, truth, checks, again)
-            yield from _appearance_section(subject)
+            draw = partial(_appearance_section, found=found)
+        subject = page.ReportedAppearance(name, appearance, None, [], again)
+        documents = [found.appearances[name], *_name_truths(appearance, found)]
+        digests = (hash_file(folder / store.DOCUMENT_FILE) for folder in documents)
+        yield from drawn.draw((name, again, *digests), partial(_add_checks, draw, subject), checks)
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
+
+
+def _add_checks(
+    draw: Callable[[page.ReportedAppearance], Iterator[page.Block]],
+    subject: page.ReportedAppearance,
+    checks: list[page.Check],
+) -> Iterator[page.Block]:
+    """Draw the section of an appearance, and add its checks to a list."""
+    return draw(replace(subject, checks=checks))
+
+
+def _name_truths(appearance: SkinAppearance, found: ReportInputs) -> list[Path]:
+    """Return the folders of an appearance's ground truths that were found."""
+    states = describe_parts(appearance).get("facial_color", {}).get("truth", {})
+    names = (str(appearance.parameters.get("truth", "")), *states.values())
+    return [found.truths[name] for name in names if name in found.truths]
 
 
 def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.Block]:
@@ -241,8 +266,12 @@ def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.B
             yield from _document_section(document)
 
 
-def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
-    appearance, truth = subject.appearance, subject.truth
+def _appearance_section(
+    subject: page.ReportedAppearance, found: ReportInputs
+) -> Iterator[page.Block]:
+    appearance = subject.appearance
+    truth = found.find_truth(appearance)
+    subject = replace(subject, truth=truth)
     kind = "Fused person" if is_fused(appearance) else "Maps"
     yield page.Heading(f"{kind}: {subject.name}", level=2)
     if is_fused(appearance):

@@ -61,13 +61,14 @@ def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmar
 
 
 def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchmarks):
-    """The first has the finished rig alone, and browsers load it again; the last has all."""
+    """Those before the last have what is done alone, and browsers load them again."""
     for rig in ("flash", "dome"):
         made = tmp_path / "demo" / f"session-{rig}-white"
         monkeypatch.setitem(RIGS, rig, lambda *_, made=made: made.mkdir())
-    built = []
+    built, kept = [], []
 
-    def build(paths, *, title, reload_s, folder):
+    def build(paths, *, title, reload_s, folder, drawn):
+        kept.append(drawn)
         built.append(([path.name for path in paths], title, reload_s))
         return f"report {len(built)}"
 
@@ -76,14 +77,34 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
     run_demo(tmp_path / "demo", ["dome", "flash"], console=Console(False), jobs=1)
     assert built == [
         (["session-flash-white", "demo.json"], "skinrig demo: flash; other rigs follow", 10),
+        (
+            ["session-dome-white", "session-flash-white", "demo.json"],
+            "skinrig demo: flash, dome; the fused person follows",
+            10,
+        ),
         (["demo"], "skinrig demo", None),
     ]
-    assert (tmp_path / "demo" / "report.html").read_text() == "report 2"
+    assert all(drawn is kept[0] for drawn in kept)
+    assert (tmp_path / "demo" / "report.html").read_text() == "report 3"
 
 
 def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     with pytest.raises(SimulationError, match="width"):
         run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.long
+def test_fusion_in_process_follows_all_rigs(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "_run_rig", small_demo.run_empty_rig)
+    monkeypatch.setattr(demo, "_fuse_rigs", small_demo.fuse_marks)
+    parts = list(demo._run_in_processes(["flash", "dome"], (tmp_path,), 2))
+    assert {name for name, _ in parts[:2]} == {"flash", "dome"}
+    assert parts[2][0] == demo.PERSON_PART
+    marks = ["session-dome-white", "session-flash-white"]
+    assert parts[2][1][0].errors == [[["flash", "dome"], marks]]
+    with pytest.raises(DemoError, match="no probe"):
+        list(demo._run_in_processes(["gradient", "probe"], (tmp_path,), 2))
     assert not multiprocessing.active_children()
 
 

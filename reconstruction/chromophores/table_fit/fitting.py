@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from model import spectra
 from model.color_table import ColorTable
+from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores.model_error import model_covariance
 from reconstruction.chromophores.start import evaluate_table, inverse_table_for
@@ -75,7 +76,10 @@ def _fit(
     masks = np.empty((len(kernels.INVERSION_MASKS), len(rgb)), dtype=np.bool_)
     free, known, usable = shading
     start = inverse_table_for(table, free)
-    kernels.fit_pixels(
+    run_in_blocks(
+        kernels.fit_pixels,
+        len(rgb),
+        _TASK_PIXELS,
         rgb,
         variance,
         known,
@@ -96,7 +100,6 @@ def _fit(
         limits[1],
         maps,
         masks,
-        _TASK_PIXELS,
     )
     return maps, masks
 

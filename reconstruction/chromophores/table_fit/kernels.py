@@ -6,11 +6,11 @@ Call it through `reconstruction.chromophores`; its tests repeat it in plain NumP
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, void
+from numba import boolean, float32, float64, int64, njit, void
 
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.chromophores.weight_kernels import color_weights, quadratic_form
-from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
+from reconstruction.compiled import BLOCK_KERNEL_OPTIONS, FASTMATH_CONTRACT, readonly_array_type
 
 MAX_FIT_STEPS = 20
 MAX_AXIS_STEP = 0.12
@@ -188,9 +188,10 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         float32,  # largest relative standard error of an identifiable chromophore
         float32[:, ::1],  # maps (7, n): see MAPS
         boolean[:, ::1],  # masks (5, n): see MASKS
-        int64,  # pixels a task
+        int64,  # first pixel
+        int64,  # pixel after the last
     ),
-    **PIXEL_KERNEL_OPTIONS,
+    **BLOCK_KERNEL_OPTIONS,
 )
 def fit_pixels(  # type: ignore[no-untyped-def]
     rgb,
@@ -214,12 +215,12 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     limit,
     maps,
     masks,
-    block,
+    first,
+    last,
 ):
     """Fit every pixel; the arguments' shapes are in the signature above."""
-    pixels = rgb.shape[0]
-    last = cells.shape[0]
-    length = np.float32(last)
+    intervals = cells.shape[0]
+    length = np.float32(intervals)
     grid = twin_log.shape[0]
     has_optics = optics.shape[0] > 1
     has_factors = factors.shape[0] > 1
@@ -228,207 +229,203 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     each_variance = variance.shape[0] > 1
     each_shading = shading.shape[0] > 1
     each_usable = usable.shape[0] > 1
-    for task in prange((pixels + block - 1) // block):
-        for n in range(task * block, min(pixels, (task + 1) * block)):
-            k = n if each_variance else 0
-            known = _ONE if free else shading[n if each_shading else 0]
-            d0, d1, d2 = rgb[n, 0], rgb[n, 1], rgb[n, 2]
-            v0, v1, v2 = variance[k, 0], variance[k, 1], variance[k, 2]
-            good = (
-                usable[n if each_usable else 0]
-                and known > _ZERO
-                and known < MAX_FINITE
-                and d0 > _ZERO
-                and d1 > _ZERO
-                and d2 > _ZERO
-                and d0 + d1 + d2 < MAX_FINITE
-                and v0 >= _ZERO
-                and v1 >= _ZERO
-                and v2 >= _ZERO
-                and v0 + v1 + v2 < MAX_FINITE
-            )
-            if not good:
-                for m in range(7):
-                    maps[m, n] = np.nan
-                for m in range(5):
-                    masks[m, n] = False
-                continue
-            # Relative variances by noise, before the color is divided by its shading
-            i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
-            v0, v1, v2 = v0 * i0 * i0, v1 * i1 * i1, v2 * i2 * i2
-            if not free:
-                unshaded = _ONE / known
-                d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
-            l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
-            y0, y1 = _project(projection, l0, l1, l2)
-            height = normal[0] * l0 + normal[1] * l1 + normal[2] * l2
-            a, b = _guess(start_axes, start_slopes, y0, y1, height)
-            noise = v0, v1, v2
-            w = color_weights(noise, model, optics, a, b, free)
-            a_of_weights, b_of_weights = a, b
-            twin_brightness = -np.float32(np.inf)
-            if free:
-                g0 = min(max(int(y0 + _HALF), 0), grid - 1)
-                g1 = min(max(int(y1 + _HALF), 0), grid - 1)
-                twin_brightness = twin_log[g0, g1]
-            a_before, b_before, cost_before = a, b, np.float32(np.inf)
-            step_a = step_b = _ZERO
-            s = _ONE
-            aa = bb = _ONE
-            ab = ra = rb = _ZERO
-            e0 = e1 = e2 = _ZERO
-            ga0 = ga1 = ga2 = gb0 = gb1 = gb2 = _ZERO
+    for n in range(first, last):
+        k = n if each_variance else 0
+        known = _ONE if free else shading[n if each_shading else 0]
+        d0, d1, d2 = rgb[n, 0], rgb[n, 1], rgb[n, 2]
+        v0, v1, v2 = variance[k, 0], variance[k, 1], variance[k, 2]
+        good = (
+            usable[n if each_usable else 0]
+            and known > _ZERO
+            and known < MAX_FINITE
+            and d0 > _ZERO
+            and d1 > _ZERO
+            and d2 > _ZERO
+            and d0 + d1 + d2 < MAX_FINITE
+            and v0 >= _ZERO
+            and v1 >= _ZERO
+            and v2 >= _ZERO
+            and v0 + v1 + v2 < MAX_FINITE
+        )
+        if not good:
+            for m in range(7):
+                maps[m, n] = np.nan
+            for m in range(5):
+                masks[m, n] = False
+            continue
+        # Relative variances by noise, before the color is divided by its shading
+        i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
+        v0, v1, v2 = v0 * i0 * i0, v1 * i1 * i1, v2 * i2 * i2
+        if not free:
+            unshaded = _ONE / known
+            d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
+        l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
+        y0, y1 = _project(projection, l0, l1, l2)
+        height = normal[0] * l0 + normal[1] * l1 + normal[2] * l2
+        a, b = _guess(start_axes, start_slopes, y0, y1, height)
+        noise = v0, v1, v2
+        w = color_weights(noise, model, optics, a, b, free)
+        a_of_weights, b_of_weights = a, b
+        twin_brightness = -np.float32(np.inf)
+        if free:
+            g0 = min(max(int(y0 + _HALF), 0), grid - 1)
+            g1 = min(max(int(y1 + _HALF), 0), grid - 1)
+            twin_brightness = twin_log[g0, g1]
+        a_before, b_before, cost_before = a, b, np.float32(np.inf)
+        step_a = step_b = _ZERO
+        s = _ONE
+        aa = bb = _ONE
+        ab = ra = rb = _ZERO
+        e0 = e1 = e2 = _ZERO
+        ga0 = ga1 = ga2 = gb0 = gb1 = gb2 = _ZERO
+        done = False
+        reweights = 0
+        for step in range(MAX_FIT_STEPS):
+            if has_optics and step > 0:
+                moved = max(abs(a - a_of_weights), abs(b - b_of_weights))
+                if moved > REWEIGHT_STEP and reweights < MAX_REWEIGHTS:
+                    reweights += 1
+                    w = color_weights(noise, model, optics, a, b, free)
+                    a_of_weights, b_of_weights = a, b
+                    # of other weights, but the fold's guard stays on
+                    cost_before = np.float32(0.9 * MAX_FINITE)
+                elif done:
+                    break
             done = False
-            reweights = 0
-            for step in range(MAX_FIT_STEPS):
-                if has_optics and step > 0:
-                    moved = max(abs(a - a_of_weights), abs(b - b_of_weights))
-                    if moved > REWEIGHT_STEP and reweights < MAX_REWEIGHTS:
-                        reweights += 1
-                        w = color_weights(noise, model, optics, a, b, free)
-                        a_of_weights, b_of_weights = a, b
-                        # of other weights, but the fold's guard stays on
-                        cost_before = np.float32(0.9 * MAX_FINITE)
-                    elif done:
-                        break
-                done = False
-                i, j = a * length, b * length
-                row, column = min(int(i), last - 1), min(int(j), last - 1)
-                x, y = i - np.float32(row), j - np.float32(column)
-                here = cells[row, column]
-                f0, x0, y0_ = _cell(here[0], x, y)
-                f1, x1, y1_ = _cell(here[1], x, y)
-                f2, x2, y2_ = _cell(here[2], x, y)
-                r0, r1, r2 = _ONE / f0, _ONE / f1, _ONE / f2
-                q0, q1, q2 = d0 * r0, d1 * r1, d2 * r2
-                if free:
-                    s = w[6] * q0 + w[7] * q1 + w[8] * q2
-                    t = _ONE / s
-                    e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
-                else:
-                    # log(q) = log(mean) + log(q / mean), the second term to first order around the
-                    # mean: a shading known to 50 percent leaves factors q far from 1.
-                    mean = (q0 + q1 + q2) / _THREE
-                    t = _ONE / mean
-                    common = math.log(mean) - _ONE
-                    e0, e1, e2 = q0 * t + common, q1 * t + common, q2 * t + common
-                off_a, off_b = prior[0] - a, prior[1] - b
-                cost = quadratic_form(w, e0, e1, e2, e0, e1, e2)
-                cost += prior[2] * off_a * off_a + prior[3] * off_b * off_b
-                r0, r1, r2 = r0 * length, r1 * length, r2 * length
-                ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
-                gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
-                facing = (ga1 * gb2 - ga2 * gb1) + (ga2 * gb0 - ga0 * gb2) + (ga0 * gb1 - ga1 * gb0)
-                # Beyond the fold, where the gray axis meets the surface's other side, is the
-                # second solution.
-                beyond = free and cost_before < MAX_FINITE and facing * light_side < _ZERO
-                if beyond or cost > cost_before * np.float32(1.01) + np.float32(1e-9):
-                    # Overshot: return half of the way to the last accepted point.
-                    a, b = _HALF * (a + a_before), _HALF * (b + b_before)
-                    step_a, step_b = a - a_before, b - b_before
-                    if max(abs(step_a), abs(step_b)) < 1e-5:
-                        a, b = a_before, b_before
-                        break
-                    continue
-                cost_before, a_before, b_before = cost, a, b
-                aa = quadratic_form(w, ga0, ga1, ga2, ga0, ga1, ga2) + prior[2]
-                ab = quadratic_form(w, ga0, ga1, ga2, gb0, gb1, gb2)
-                bb = quadratic_form(w, gb0, gb1, gb2, gb0, gb1, gb2) + prior[3]
-                ra = quadratic_form(w, ga0, ga1, ga2, e0, e1, e2) + prior[2] * off_a
-                rb = quadratic_form(w, gb0, gb1, gb2, e0, e1, e2) + prior[3] * off_b
-                haa, hab, hbb = aa, ab, bb
-                step_a, step_b = _solve(aa, ab, bb, ra, rb)
-                if step > 1 and not free:
-                    # Off the surface Gauss-Newton converges slowly. Newton's Hessian subtracts the
-                    # second derivatives of log f, f''/f - (f'/f)^2, weighted by the residual that
-                    # the linear step leaves.
-                    o0 = e0 - ga0 * step_a - gb0 * step_b
-                    o1 = e1 - ga1 * step_a - gb1 * step_b
-                    o2 = e2 - ga2 * step_a - gb2 * step_b
-                    z0 = w[0] * o0 + w[1] * o1 + w[2] * o2
-                    z1 = w[1] * o0 + w[3] * o1 + w[4] * o2
-                    z2 = w[2] * o0 + w[4] * o1 + w[5] * o2
-                    r0, r1, r2 = r0 * length, r1 * length, r2 * length
-                    xx0, xy0, yy0 = _cell_bend(here[0], x, y)
-                    xx1, xy1, yy1 = _cell_bend(here[1], x, y)
-                    xx2, xy2, yy2 = _cell_bend(here[2], x, y)
-                    haa -= (
-                        z0 * (xx0 * r0 - ga0 * ga0)
-                        + z1 * (xx1 * r1 - ga1 * ga1)
-                        + z2 * (xx2 * r2 - ga2 * ga2)
-                    )
-                    hab -= (
-                        z0 * (xy0 * r0 - ga0 * gb0)
-                        + z1 * (xy1 * r1 - ga1 * gb1)
-                        + z2 * (xy2 * r2 - ga2 * gb2)
-                    )
-                    hbb -= (
-                        z0 * (yy0 * r0 - gb0 * gb0)
-                        + z1 * (yy1 * r1 - gb1 * gb1)
-                        + z2 * (yy2 * r2 - gb2 * gb2)
-                    )
-                    straight = float64(aa) * bb - float64(ab) * ab
-                    bent = float64(haa) * hbb - float64(hab) * hab
-                    if haa > _ZERO and hbb > _ZERO and bent > 0.25 * straight:
-                        step_a, step_b = _solve(haa, hab, hbb, ra, rb)
-                    else:
-                        haa, hab, hbb = aa, ab, bb
-                step_a, step_b = _bounded(a, b, step_a, step_b, haa, hab, hbb, ra, rb)
-                a += step_a
-                b += step_b
-                gain = abs(step_a * ra + step_b * rb)
-                longest = max(abs(step_a) / a, abs(step_b) / b)
-                misfit = cost - gain
-                if (
-                    gain < gain_tol + MISFIT_GAIN_TOL * misfit
-                    or (
-                        longest < RELATIVE_STEP_TOL
-                        and max(abs(step_a), abs(step_b)) < AXIS_STEP_TOL
-                    )
-                    or (longest < NOISY_STEP_TOL and gain < misfit)
-                ):
-                    done = True
-                    if not has_optics:
-                        break
-            # The linear model gives the change of the residual by the last step.
-            e0 -= ga0 * step_a + gb0 * step_b
-            e1 -= ga1 * step_a + gb1 * step_b
-            e2 -= ga2 * step_a + gb2 * step_b
-            residual = math.sqrt(max(quadratic_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
-            # The part of the residual that shading explains: all of the mean when free, else its
-            # most probable part given the shading's variance.
-            shift = w[6] * e0 + w[7] * e1 + w[8] * e2
+            i, j = a * length, b * length
+            row, column = min(int(i), intervals - 1), min(int(j), intervals - 1)
+            x, y = i - np.float32(row), j - np.float32(column)
+            here = cells[row, column]
+            f0, x0, y0_ = _cell(here[0], x, y)
+            f1, x1, y1_ = _cell(here[1], x, y)
+            f2, x2, y2_ = _cell(here[2], x, y)
+            r0, r1, r2 = _ONE / f0, _ONE / f1, _ONE / f2
+            q0, q1, q2 = d0 * r0, d1 * r1, d2 * r2
             if free:
-                s *= _ONE + shift
+                s = w[6] * q0 + w[7] * q1 + w[8] * q2
+                t = _ONE / s
+                e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
             else:
-                shift *= common_variance * w[9]
-                s = np.float32(math.exp(shift))
-            e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
-            a = min(max(a, _MIN_AXIS_FRACTION), _ONE)
-            b = min(max(b, _MIN_AXIS_FRACTION), _ONE)
-            wide = float64(aa) * bb
-            det = max(wide - float64(ab) * ab, 1e-12 * wide) + 1e-300
-            inverse = np.float32(1.0 / det)
-            relative_a = _THREE * math.sqrt(bb * inverse) / a
-            relative_b = _THREE * math.sqrt(aa * inverse) / b
-            if has_factors:
-                nodes = np.float32(factors.shape[0] - 1)
-                factor_a, factor_b = _between_nodes(factors, a * nodes, b * nodes)
-                relative_a *= factor_a
-                relative_b *= factor_b
-            distance = math.sqrt((e0 * e0 + e1 * e1 + e2 * e2) / _THREE)
-            maps[0, n] = ends[0] * a * a * a
-            maps[1, n] = ends[1] * b * b * b
-            maps[2, n] = s * known
-            maps[3, n] = relative_a * maps[0, n]
-            maps[4, n] = relative_b * maps[1, n]
-            maps[5, n] = residual
-            maps[6, n] = distance
-            twin = free and (l0 + l1 + l2) / _THREE <= twin_brightness + log_shading_max
-            outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
-            close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED_STEP
-            masks[0, n] = (done or close) and not outside
-            masks[1, n] = outside
-            masks[2, n] = relative_a <= limit and a < _ONE and not twin
-            masks[3, n] = relative_b <= limit and b < _ONE and not twin
-            masks[4, n] = twin
+                # log(q) = log(mean) + log(q / mean), the second term to first order around the
+                # mean: a shading known to 50 percent leaves factors q far from 1.
+                mean = (q0 + q1 + q2) / _THREE
+                t = _ONE / mean
+                common = math.log(mean) - _ONE
+                e0, e1, e2 = q0 * t + common, q1 * t + common, q2 * t + common
+            off_a, off_b = prior[0] - a, prior[1] - b
+            cost = quadratic_form(w, e0, e1, e2, e0, e1, e2)
+            cost += prior[2] * off_a * off_a + prior[3] * off_b * off_b
+            r0, r1, r2 = r0 * length, r1 * length, r2 * length
+            ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
+            gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
+            facing = (ga1 * gb2 - ga2 * gb1) + (ga2 * gb0 - ga0 * gb2) + (ga0 * gb1 - ga1 * gb0)
+            # Beyond the fold, where the gray axis meets the surface's other side, is the
+            # second solution.
+            beyond = free and cost_before < MAX_FINITE and facing * light_side < _ZERO
+            if beyond or cost > cost_before * np.float32(1.01) + np.float32(1e-9):
+                # Overshot: return half of the way to the last accepted point.
+                a, b = _HALF * (a + a_before), _HALF * (b + b_before)
+                step_a, step_b = a - a_before, b - b_before
+                if max(abs(step_a), abs(step_b)) < 1e-5:
+                    a, b = a_before, b_before
+                    break
+                continue
+            cost_before, a_before, b_before = cost, a, b
+            aa = quadratic_form(w, ga0, ga1, ga2, ga0, ga1, ga2) + prior[2]
+            ab = quadratic_form(w, ga0, ga1, ga2, gb0, gb1, gb2)
+            bb = quadratic_form(w, gb0, gb1, gb2, gb0, gb1, gb2) + prior[3]
+            ra = quadratic_form(w, ga0, ga1, ga2, e0, e1, e2) + prior[2] * off_a
+            rb = quadratic_form(w, gb0, gb1, gb2, e0, e1, e2) + prior[3] * off_b
+            haa, hab, hbb = aa, ab, bb
+            step_a, step_b = _solve(aa, ab, bb, ra, rb)
+            if step > 1 and not free:
+                # Off the surface Gauss-Newton converges slowly. Newton's Hessian subtracts the
+                # second derivatives of log f, f''/f - (f'/f)^2, weighted by the residual that
+                # the linear step leaves.
+                o0 = e0 - ga0 * step_a - gb0 * step_b
+                o1 = e1 - ga1 * step_a - gb1 * step_b
+                o2 = e2 - ga2 * step_a - gb2 * step_b
+                z0 = w[0] * o0 + w[1] * o1 + w[2] * o2
+                z1 = w[1] * o0 + w[3] * o1 + w[4] * o2
+                z2 = w[2] * o0 + w[4] * o1 + w[5] * o2
+                r0, r1, r2 = r0 * length, r1 * length, r2 * length
+                xx0, xy0, yy0 = _cell_bend(here[0], x, y)
+                xx1, xy1, yy1 = _cell_bend(here[1], x, y)
+                xx2, xy2, yy2 = _cell_bend(here[2], x, y)
+                haa -= (
+                    z0 * (xx0 * r0 - ga0 * ga0)
+                    + z1 * (xx1 * r1 - ga1 * ga1)
+                    + z2 * (xx2 * r2 - ga2 * ga2)
+                )
+                hab -= (
+                    z0 * (xy0 * r0 - ga0 * gb0)
+                    + z1 * (xy1 * r1 - ga1 * gb1)
+                    + z2 * (xy2 * r2 - ga2 * gb2)
+                )
+                hbb -= (
+                    z0 * (yy0 * r0 - gb0 * gb0)
+                    + z1 * (yy1 * r1 - gb1 * gb1)
+                    + z2 * (yy2 * r2 - gb2 * gb2)
+                )
+                straight = float64(aa) * bb - float64(ab) * ab
+                bent = float64(haa) * hbb - float64(hab) * hab
+                if haa > _ZERO and hbb > _ZERO and bent > 0.25 * straight:
+                    step_a, step_b = _solve(haa, hab, hbb, ra, rb)
+                else:
+                    haa, hab, hbb = aa, ab, bb
+            step_a, step_b = _bounded(a, b, step_a, step_b, haa, hab, hbb, ra, rb)
+            a += step_a
+            b += step_b
+            gain = abs(step_a * ra + step_b * rb)
+            longest = max(abs(step_a) / a, abs(step_b) / b)
+            misfit = cost - gain
+            if (
+                gain < gain_tol + MISFIT_GAIN_TOL * misfit
+                or (longest < RELATIVE_STEP_TOL and max(abs(step_a), abs(step_b)) < AXIS_STEP_TOL)
+                or (longest < NOISY_STEP_TOL and gain < misfit)
+            ):
+                done = True
+                if not has_optics:
+                    break
+        # The linear model gives the change of the residual by the last step.
+        e0 -= ga0 * step_a + gb0 * step_b
+        e1 -= ga1 * step_a + gb1 * step_b
+        e2 -= ga2 * step_a + gb2 * step_b
+        residual = math.sqrt(max(quadratic_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
+        # The part of the residual that shading explains: all of the mean when free, else its
+        # most probable part given the shading's variance.
+        shift = w[6] * e0 + w[7] * e1 + w[8] * e2
+        if free:
+            s *= _ONE + shift
+        else:
+            shift *= common_variance * w[9]
+            s = np.float32(math.exp(shift))
+        e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
+        a = min(max(a, _MIN_AXIS_FRACTION), _ONE)
+        b = min(max(b, _MIN_AXIS_FRACTION), _ONE)
+        wide = float64(aa) * bb
+        det = max(wide - float64(ab) * ab, 1e-12 * wide) + 1e-300
+        inverse = np.float32(1.0 / det)
+        relative_a = _THREE * math.sqrt(bb * inverse) / a
+        relative_b = _THREE * math.sqrt(aa * inverse) / b
+        if has_factors:
+            nodes = np.float32(factors.shape[0] - 1)
+            factor_a, factor_b = _between_nodes(factors, a * nodes, b * nodes)
+            relative_a *= factor_a
+            relative_b *= factor_b
+        distance = math.sqrt((e0 * e0 + e1 * e1 + e2 * e2) / _THREE)
+        maps[0, n] = ends[0] * a * a * a
+        maps[1, n] = ends[1] * b * b * b
+        maps[2, n] = s * known
+        maps[3, n] = relative_a * maps[0, n]
+        maps[4, n] = relative_b * maps[1, n]
+        maps[5, n] = residual
+        maps[6, n] = distance
+        twin = free and (l0 + l1 + l2) / _THREE <= twin_brightness + log_shading_max
+        outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
+        close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED_STEP
+        masks[0, n] = (done or close) and not outside
+        masks[1, n] = outside
+        masks[2, n] = relative_a <= limit and a < _ONE and not twin
+        masks[3, n] = relative_b <= limit and b < _ONE and not twin
+        masks[4, n] = twin

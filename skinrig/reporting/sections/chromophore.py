@@ -1,6 +1,7 @@
 """Report section on chromophores: errors by melanin band, and identifiability."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -171,7 +172,8 @@ def draw_identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page
         yield page.Plots(_plots_of_table(camera, illuminant))
 
 
-def _plots_of_table(camera: str, illuminant: str) -> list[str]:
+@cache
+def _plots_of_table(camera: str, illuminant: str) -> tuple[str, ...]:
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
     plots = []
     choices: tuple[tuple[Literal["known"] | None, str], ...] = (
@@ -191,4 +193,4 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
             figures.draw_sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
             for name, relative in errors.items()
         ]
-    return plots
+    return tuple(plots)

@@ -31,6 +31,15 @@ def test_masked_and_undefined_trials_do_not_count():
     assert np.isnan(metrics.coverage([np.nan], [1.0], [0.0]).fraction)
 
 
+@pytest.mark.parametrize("n", [1, 2, 7, 400])
+def test_median_interval_is_quantile_of_drawn_medians(n):
+    values = np.random.default_rng(n).integers(0, 1 + n // 2, n) / 7.0  # with equal values
+    found = metrics.median_with_interval(values, rng=np.random.default_rng(5))
+    draws = np.random.default_rng(5).integers(0, n, (metrics.N_MEDIAN_DRAWS, n))
+    medians = np.median(values[draws], axis=1)
+    assert found == (np.median(values), tuple(np.quantile(medians, [0.16, 0.84])))
+
+
 def test_median_interval_shrinks_with_root_of_count(rng):
     def width(n):
         low, high = metrics.median_with_interval(rng.normal(size=n), rng=rng)[1]

@@ -11,6 +11,7 @@ from capture.calibration import store
 from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
+from skinrig.calibrating import gradient
 from skinrig.calibrating.gradient import calibrate_gradient, has_gradient_session
 from skinrig.calibrating.outcome import CalibratingError, TargetSessions
 
@@ -87,6 +88,30 @@ def test_two_balls_rigs_or_other_kinds_are_refused(tmp_path):
         calibrate_gradient("lights", TargetSessions([Shelf(), other], tmp_path, MADE))
     with pytest.raises(CalibratingError, match="white"):
         calibrate_gradient("white", TargetSessions([Shelf()], tmp_path, MADE))
+
+
+def test_lights_and_polarizers_share_one_survey(tmp_path, monkeypatch):
+    """The survey of a session is reused; other sessions and callers get their own."""
+    surveyed = []
+
+    def survey(sessions):
+        surveyed.append(sessions.sessions[0].id)
+        raise CalibratingError("surveyed")
+
+    monkeypatch.setattr(gradient, "_survey", survey)
+    known = object()
+    monkeypatch.setattr(gradient, "number_findings", lambda findings: pytest.fail(str(findings)))
+    surveys = {("sha256:0",): (SimpleNamespace(findings=(known,)), ())}
+    for kind in ("lights", "polarization"):
+        with pytest.raises(pytest.fail.Exception, match=str(known)):
+            calibrate_gradient(kind, TargetSessions([Shelf()], tmp_path, MADE), surveys)
+    assert not surveyed
+    other = Shelf(name="other")
+    other.content_hash = "sha256:1"
+    for session, given in ((other, surveys), (Shelf(), None)):
+        with pytest.raises(CalibratingError, match="surveyed"):
+            calibrate_gradient("lights", TargetSessions([session], tmp_path, MADE), given)
+    assert surveyed == ["other", "S"]
 
 
 def test_rig_is_identified_by_its_controller():

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.reporting import page, report
+from skinrig.reporting.drawn_sections import DrawnSections
 from skinrig.reporting.folders import discover
 from skinrig.reporting.sections import subsurface
 from skinrig.reporting.sections.chromophore import draw_panels
@@ -51,6 +53,28 @@ def test_page_is_reproducible_and_requests_nothing(folder):
     assert "default-src 'none'" in html
     assert "http://" not in html.replace("http://www.w3.org", "")
     assert html.count("<script") == 1
+
+
+def test_sections_of_unchanged_maps_are_not_redrawn(folder, monkeypatch):
+    drawn = DrawnSections()
+    first = report.build([folder], drawn=drawn)
+    with monkeypatch.context() as patch:
+        patch.setattr(report.chromophore, "draw_panels", None)  # drawing would raise
+        assert report.build([folder], drawn=drawn) == first == report.build([folder], drawn=drawn)
+
+
+@pytest.mark.parametrize("changed", ["appearance", "truth-flash"])
+def test_sections_of_changed_maps_are_redrawn(changed, folder):
+    drawn = DrawnSections()
+    first = report.build([folder], drawn=drawn)
+    maps = store.read(folder / changed)
+    lighter = dataclasses.replace(maps.maps["melanin"], values=0.5 * maps.maps["melanin"].values)
+    edited = dataclasses.replace(maps, maps={**maps.maps, "melanin": lighter})
+    shutil.rmtree(folder / changed)
+    store.write(folder / changed, edited)
+    again = report.build([folder], drawn=drawn)
+    assert again != first
+    assert again == report.build([folder])
 
 
 def test_truth_estimate_error_and_stderr_are_adjacent(folder):
