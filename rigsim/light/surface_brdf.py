@@ -47,7 +47,7 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import observe_skin
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_layers import ETA
 
@@ -179,7 +179,7 @@ def skin_surface(
         Textures; oil is most on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
     points, regions = subject.perfusion.points_mm, subject.perfusion.regions
-    reflectance = ObservedSkin(subject, state, camera, light).reflectance()
+    reflectance = observe_skin(subject, state, camera, light).reflectance()
     hair = subject.hair[..., None]
     scale = np.float32(shading.interior_scale(ETA))
     over = np.asarray(HAIR_REFLECTANCE, np.float32)

@@ -125,12 +125,14 @@ class CameraHits:
         return out.reshape(self.shape)
 
     def average(self, rows: Float32Array) -> Float32Array:
-        """Average hits, (n, C), over each pixel's covered part, shape (H, W, C); zero elsewhere."""
-        out = np.zeros((self.shape[0] * self.shape[1], rows.shape[1]), np.float32)
+        """Average hits over each pixel's covered part: (n, ...) to (H, W, ...); zero elsewhere."""
+        inner = rows.shape[1:]
+        out = np.zeros((self.shape[0] * self.shape[1], math.prod(inner)), np.float32)
         if len(rows):
             count = np.diff(self.first).astype(np.float32)
-            out[self.pixel] = np.add.reduceat(rows, self.first[:-1], axis=0) / count[:, None]
-        return out.reshape(*self.shape, rows.shape[1])
+            flat = rows.reshape(len(rows), -1)
+            out[self.pixel] = np.add.reduceat(flat, self.first[:-1], axis=0) / count[:, None]
+        return out.reshape(*self.shape, *inner)
 
 
 class FastSurface:
