@@ -134,12 +134,11 @@ class DomeScene(FaceScene):
         scenery = self._scenery(rig.views[0], self._geometry, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
         sampled = sample_led_light(rig, self.subject, self._caster)
-        held = self._observe()  # what the rules compute of the skin is reused
+        self._skins = self._observe()  # what the rules compute of the skin is reused
         seen = (scenery, white, sampled, movement, motion)
         self.needs = select_dome_effects(rig, self.subject, state, *seen)
         self.subject = select_face_tissue(self.subject, self.needs)
         self._skins = self._observe()
-        del held
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)

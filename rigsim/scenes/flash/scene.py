@@ -135,11 +135,10 @@ class FlashScene(FaceScene):
         self.variant = self._caster.choice
         """Variant that renders the images, with the reason."""
         self._effects, self._power = effects, power
-        held = self._observe()  # what the rules compute of the skin is reused
+        self._skins = self._observe()  # what the rules compute of the skin is reused
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.subject = select_face_tissue(self.subject, self.needs)
         self._skins = self._observe()
-        del held
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
