@@ -1,6 +1,6 @@
 """Compare sessions with all effects of light with those of the rules: seconds, and errors of maps.
 
-    python tools/judge_omissions.py RIG OUT [--people 3] [--seed 770]
+    python tools/judge_omissions.py RIG OUT [--people 3] [--seed 770] [--width PX]
 
 Each person is simulated twice with the same noise, each time in a process of its own: with all
 effects at their finest settings, and with those that the rules build. Seconds are the processor
@@ -38,7 +38,8 @@ from skinrig.simulating.simulation import simulate
 
 PRESETS = ("II", "IV", "VI", "I", "III", "V")
 MAX_GROWTH = 0.05
-WIDTHS_PX = {"flash": 192, "dome": 96, "gradient": 96, "probe": None}
+WIDTHS_PX: dict[str, int | None] = {"flash": 192, "dome": 256, "gradient": 96, "probe": None}
+"""Image widths, px; a dome of fewer pixels cannot be calibrated."""
 DOME_OPTIONS = {"lights": 12, "views": 4}
 
 
@@ -85,6 +86,8 @@ def start(rig: str, out: Path, subject: str, seed: int, everything: bool) -> flo
     """Run `simulate_one` in a process of its own."""
     asked = [rig, str(out), "--one", subject, "--seed", str(seed)]
     asked += ["--everything"] if everything else []
+    if WIDTHS_PX[rig] is not None:
+        asked += ["--width", str(WIDTHS_PX[rig])]
     done = subprocess.run(
         [sys.executable, __file__, *asked], check=True, capture_output=True, text=True
     )
@@ -127,9 +130,12 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--people", type=int, default=3)
     parser.add_argument("--seed", type=int, default=770)
+    parser.add_argument("--width", type=int, help="image width, px; not of the probe")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     parser.add_argument("--everything", action="store_true", help=argparse.SUPPRESS)
     asked = parser.parse_args()
+    if asked.width is not None:
+        WIDTHS_PX[asked.rig] = asked.width
     if asked.one:
         print(simulate_one(asked.rig, asked.out, asked.one, asked.seed, asked.everything))
         return
