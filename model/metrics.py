@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from model.arrays import Float64Array, Int64Array
 from model.checks import Checks
@@ -112,10 +112,12 @@ def coverage(
     n = int(np.count_nonzero(counted))
     if n == 0:
         return Coverage(float("nan"), (0.0, 1.0), 0)
-    reach = stats.norm.ppf(0.5 + level / 2)
+    reach = special.ndtri(0.5 + level / 2)
     k = int(np.count_nonzero(deviation[counted] <= reach * error[counted]))
-    test = stats.binomtest(k, n).proportion_ci(0.95, method="exact")
-    return Coverage(k / n, (float(test.low), float(test.high)), n)
+    # Clopper and Pearson (1934); scipy.stats has the same and takes long to import
+    low = float(special.betaincinv(k, n - k + 1, 0.025)) if k > 0 else 0.0
+    high = float(special.betaincinv(k + 1, n - k, 0.975)) if k < n else 1.0
+    return Coverage(k / n, (low, high), n)
 
 
 def median_with_interval(

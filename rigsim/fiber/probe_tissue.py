@@ -5,12 +5,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 
 from rigsim.arrays import Float64Array
-from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
 from rigsim.subject.person_skin import PersonSkin, PersonSkinError, SiteSkin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.subject.tissue_pressure import INCOMPRESSIBLE_BLOOD_FRACTION, blood_ratio
@@ -22,6 +21,9 @@ from rigsim.tissue.skin_layers import (
     skin_layer_stack,
 )
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
+
+if TYPE_CHECKING:
+    from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
 
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
 
@@ -144,8 +146,11 @@ class FibrousTissue:
         """Return "anisotropic"."""
         return "anisotropic"
 
-    def medium(self) -> AnisotropicTissue:
+    def medium(self) -> "AnisotropicTissue":
         """Return the anisotropic medium for the photon walk."""
+        # its kernels load on import, and faces need none
+        from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
+
         return AnisotropicTissue(
             self.sigma_a_per_mm,
             self.sigma_s_prime_per_mm / (1.0 - SKIN_ANISOTROPY),

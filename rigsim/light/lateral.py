@@ -19,6 +19,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
+from scipy.special import erf
 
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
@@ -174,8 +175,7 @@ def edge_width_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
     sigma = np.asarray(sigmas_mm, np.float64)
     weight = np.atleast_2d(np.asarray(weights, np.float64))
     x = np.linspace(0.0, 6.0 * float(sigma.max()), 20001)
-    parts = np.array([[0.5 * math.erf(t / (s * math.sqrt(2.0))) for t in x] for s in sigma])
-    edges = 0.5 + weight @ parts
+    edges = 0.5 + 0.5 * weight @ erf(x / (math.sqrt(2.0) * sigma[:, None]))
     return np.array([2.0 * np.interp(0.9, edge, x) for edge in edges])
 
 

@@ -1,11 +1,13 @@
 """Describe the skin of a face for one camera: its colors, and its lateral scattering."""
 
 from dataclasses import dataclass
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array, FloatArray
+from rigsim.caching import cached_method
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
 from rigsim.tissue.site_thickness import interpolate_thickness
@@ -13,9 +15,9 @@ from rigsim.tissue.skin_color import SkinColor, skin_color
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ObservedSkin:
-    """A face in a state, for one camera and one light."""
+    """A face in a state, for one camera and one light; see `observe_skin`."""
 
     subject: SimulatedSubject
     state: str
@@ -37,12 +39,14 @@ class ObservedSkin:
         """Blood volume fraction, shape (N, N)."""
         return self.subject.hemoglobin(self.state)
 
+    @cached_method
     def reflectance(self) -> Float32Array:
-        """Return the white-balanced reflectance, shape (N, N, 3)."""
+        """Return the white-balanced reflectance, shape (N, N, 3); callers share it."""
         return self._rgb(self.subject.melanin)
 
+    @cached_method
     def reflectance_without_melanin(self) -> Float32Array:
-        """Return the reflectance of the same skin without melanin, shape (N, N, 3)."""
+        """Return `reflectance` of the same skin without melanin; callers share it."""
         return self._rgb(np.zeros_like(self.subject.melanin))
 
     def _rgb(self, melanin: Float32Array) -> Float32Array:
@@ -113,7 +117,28 @@ class ObservedSkin:
         """Spectra of this person's skin of any pigment, of the thickness between the regions."""
         return SkinTable.load(self.subject.tissue.with_thickness_ratio(1.0))
 
+    @cached_method
     def lateral_kernels(self) -> GaussianSum:
         """Return the lateral profile at the median melanin and hemoglobin, per channel."""
         melanin, blood = (float(np.median(part)) for part in self.covered_chromophores())
         return self.table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)
+
+
+_observed: WeakValueDictionary[tuple[object, ...], ObservedSkin] = WeakValueDictionary()
+
+
+def observe_skin(
+    subject: SimulatedSubject, state: str, camera: str, illuminant: str
+) -> ObservedSkin:
+    """Return a face for one camera and light; the same as long as any caller holds it.
+
+    Parameters
+    ----------
+    subject, state, camera, illuminant
+        Fields of `ObservedSkin`.
+    """
+    key = id(subject), state, camera, illuminant  # the id stays unique while the skin holds it
+    found = _observed.get(key)
+    if found is None:
+        found = _observed[key] = ObservedSkin(subject, state, camera, illuminant)
+    return found

@@ -47,7 +47,7 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import observe_skin
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.skin_layers import ETA
 from rigsim.tissue.tissue_mc import run_in_threads
@@ -182,7 +182,7 @@ def skin_surface(
         Textures; oil is most on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
     points, regions = subject.perfusion.points_mm, subject.perfusion.regions
-    reflectance = ObservedSkin(subject, state, camera, light).reflectance()
+    reflectance = observe_skin(subject, state, camera, light).reflectance()
     hair = subject.hair[..., None]
     scale = np.float32(shading.interior_scale(ETA))
     over = np.asarray(HAIR_REFLECTANCE, np.float32)
@@ -274,23 +274,21 @@ def min_surface_reflection(packed: ArrayLike, *, max_slope_deg: float = 70.0) ->
     ndarray of float32
         Shape (n,), in the unit of R_d.
     """
-    values = np.atleast_2d(np.asarray(packed, np.float32))
-    least = np.full(len(values), np.inf, np.float32)
-    up = np.array([0.0, 0.0, 1.0], np.float32)
+    values = np.ascontiguousarray(np.atleast_2d(packed), np.float32)
+    if values.shape[-1] not in LOBE_CHANNELS:
+        raise SurfaceError(f"packed: got shape {values.shape}, expected (n, 7) or (n, 11)")
     angles = np.radians(np.linspace(0.0, max_slope_deg, 8))
-    for light in angles:
-        for camera in angles[angles <= light + 1e-9]:
-            for turn in (0.0, 0.5 * math.pi, math.pi):
-                to_light = [math.sin(light), 0.0, math.cos(light)]
-                to_camera = [
-                    math.sin(camera) * math.cos(turn),
-                    math.sin(camera) * math.sin(turn),
-                    math.cos(camera),
-                ]
-                surface = evaluate_brdf(values, up, to_light, to_camera)[1]
-                passed = boundary_transmittance(math.cos(light), math.cos(camera))
-                least = np.minimum(least, np.float32(math.pi / passed) * surface)
-    return least
+    turns = (0.0, 0.5 * math.pi, math.pi)
+    pairs = [(a, b, t) for a in angles for b in angles[angles <= a + 1e-9] for t in turns]
+    light, camera, turn = np.array(pairs).T
+    half = np.array([np.sin(light), np.zeros_like(light), np.cos(light)])
+    half += [np.sin(camera) * np.cos(turn), np.sin(camera) * np.sin(turn), np.cos(camera)]
+    length = np.linalg.norm(half, axis=0)
+    cosines = np.cos(light), np.cos(camera), np.minimum(half[2] / length, 1.0), 0.5 * length
+    passed = [boundary_transmittance(math.cos(a), math.cos(b)) for a, b, _ in pairs]
+    out = np.empty(len(values), np.float32)
+    _find_least(values, np.stack(cosines, axis=-1), math.pi / np.array(passed), out)
+    return out
 
 
 @njit(cache=True, inline="always")
@@ -408,12 +406,26 @@ def boundary_transmittance(cos_light: float, cos_camera: float) -> float:
     >>> round(boundary_transmittance(1.0, 1.0), 6)
     0.945216
     """
-    return float(_boundary(float(cos_light), float(cos_camera)))
+    return float(two_way_transmittance(float(cos_light), float(cos_camera)))
 
 
-@njit(cache=True)
-def _boundary(nl, nv):  # type: ignore[no-untyped-def]
-    return two_way_transmittance(nl, nv)
+@njit(cache=True, inline="always")
+def _lobes(p, nl, nv, nh, lh):  # type: ignore[no-untyped-def]
+    """Return the surface terms of f_r of one packed point, for cosines above zero."""
+    if p.shape[0] > 7:
+        return coated_terms(nl, nv, nh, lh, p[3], p[4], p[5], p[7], p[8], p[9], p[10])
+    return surface_terms(nl, nv, nh, lh, p[3], p[4], p[5])
+
+
+@njit(parallel=True, cache=True)
+def _find_least(packed, cosines, scale, out):  # type: ignore[no-untyped-def]
+    """Find the least scaled surface term over pairs of directions, given by n.l, n.v, n.h, l.h."""
+    for i in prange(packed.shape[0]):
+        least = np.inf
+        for k in range(cosines.shape[0]):
+            nl, nv, nh, lh = cosines[k]
+            least = min(least, scale[k] * packed[i, 6] * _lobes(packed[i], nl, nv, nh, lh))
+        out[i] = least
 
 
 @njit(cache=True, nogil=True)
@@ -431,13 +443,7 @@ def _evaluate(packed, normal, light, camera, total, specular, first, last):  # t
         length = math.sqrt(squared)
         nh = min((nl + nv) / length, 1.0)
         p = packed[i]
-        if packed.shape[1] > 7:
-            lobes = coated_terms(
-                nl, nv, nh, 0.5 * length, p[3], p[4], p[5], p[7], p[8], p[9], p[10]
-            )
-        else:
-            lobes = surface_terms(nl, nv, nh, 0.5 * length, p[3], p[4], p[5])
-        surface = p[6] * lobes
+        surface = p[6] * _lobes(p, nl, nv, nh, 0.5 * length)
         inside = two_way_transmittance(nl, nv) / math.pi
         specular[i] = surface
         for k in range(3):

@@ -11,7 +11,7 @@ import numpy as np
 from capture.rig import Rig, View
 from rigsim.arrays import FloatArray
 from rigsim.light.interreflection import WAVELENGTH_STEPS, Interreflection
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import ObservedSkin, observe_skin
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.needs.effect_sizes import edge_loss, interreflection_over_direct, max_exchange_fraction
 from rigsim.needs.effects import (
@@ -83,7 +83,7 @@ class ViewingConditions:
 
     def observe_skin(self, subject: SimulatedSubject, state: str) -> ObservedSkin:
         """Return a face under this camera and light."""
-        return ObservedSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
+        return observe_skin(subject, state, self.view.spectral_sensitivity, self.illuminant)
 
 
 def select_face_effects(

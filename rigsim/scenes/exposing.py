@@ -9,6 +9,7 @@ import numpy as np
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.light.interreflection import DEFAULT_MIN_BOUNCE_FRACTION, Interreflection
+from rigsim.light.observed_skin import ObservedSkin, observe_skin
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.needs.effect_sizes import exchange_unless_flat
 from rigsim.needs.effects import EffectSelection, PixelNoise, SceneEffects
@@ -210,6 +211,14 @@ class FaceScene(RigScene):
         if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"{quantity}: got the target {self.subject.name!r}, expected a face")
         return self.subject
+
+    def _observe(self) -> list[ObservedSkin]:
+        """Return the skin of a face for each camera; holding it shares it with other callers."""
+        if not isinstance(self.subject, SimulatedSubject):
+            return []
+        cameras = {view.spectral_sensitivity for view in self.rig.views}
+        light = self._illuminant
+        return [observe_skin(self.subject, self.state, camera, light) for camera in cameras]
 
     def _scenery(
         self, view: View, geometry: FaceGeometry, noise: PixelNoise, effects: SceneEffects

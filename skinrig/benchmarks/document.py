@@ -15,6 +15,9 @@ from skinrig.evaluating import skin_bands
 
 SCHEMA: Final = "skinrig.bench/2"
 
+MIN_BEND: Final = 1e-9
+"""Log distance below the chord of a front that rounding does not cause."""
+
 
 def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     """Return the indices of points that no other point beats in both seconds and error.
@@ -39,16 +42,25 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
 def find_knee(points: tuple[Point, ...]) -> int | None:
     """Return the index of the knee of the Pareto front, or None below 3 points.
 
-    The knee is the front's point farthest below the chord between its ends, on log-log axes.
+    The knee is the front's point farthest below the chord between its ends, on log-log axes. If
+    none is below it, the knee is the quickest point with an error within the 68 % interval of the
+    least, unless no point takes longer: the error may then decrease further.
     """
     front = pareto_front(points)
-    if len(front) < 3:
+    if len(points) < 3 or not front:
         return None
     log_s = np.log([max(points[i].timing.seconds, 1e-9) for i in front])
     log_e = np.log([max(points[i].error, 1e-300) for i in front])
-    # chord: log e = log e_0 + (log s - log s_0) (log e_n - log e_0) / (log s_n - log s_0)
-    line = log_e[0] + (log_s - log_s[0]) * (log_e[-1] - log_e[0]) / (log_s[-1] - log_s[0])
-    return front[int(np.argmax(line - log_e))]
+    if len(front) > 2:
+        # chord: log e = log e_0 + (log s - log s_0) (log e_n - log e_0) / (log s_n - log s_0)
+        line = log_e[0] + (log_s - log_s[0]) * (log_e[-1] - log_e[0]) / (log_s[-1] - log_s[0])
+        below = line - log_e
+        if below.max() > MIN_BEND:
+            return front[int(np.argmax(below))]
+    most = points[front[-1]].error_interval[1]
+    quickest = next(i for i in front if points[i].error <= max(most, points[front[-1]].error))
+    longest_s = max(point.timing.seconds for point in points)
+    return quickest if points[quickest].timing.seconds < longest_s else None
 
 
 def find_fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
@@ -108,9 +120,9 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
     found = find_fronts(stage)
     on_front = {number for front in found for number in front["points"]}
     knees = {front["knee"] for front in found}
-    names = ("error_name", "reference", "reference_error", "reference_error_means", "interval_of")
+    names = ("error_name", "seconds_name", "reference", "reference_error", "reference_error_means")
     return {
-        **{name: getattr(stage, name) for name in names},
+        **{name: getattr(stage, name) for name in (*names, "interval_of")},
         "points": [
             {
                 **_point(point, squared=stage.squared),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.benchmarks.results import SECONDS_NAME
 from skinrig.drawing import figures, point_names
 
 
@@ -64,7 +65,7 @@ def plot_error_against_time(stage: str, document: Mapping[str, Any]) -> str:
         )
     axes.margins(x=0.25, y=0.2)
     small = document.get("size") == "small"
-    _set_up_axes(axes, f"{stage}, small size" if small else stage, document["error_name"])
+    _set_up_axes(axes, f"{stage}, small size" if small else stage, document)
     legend = None
     if axes.get_legend_handles_labels()[0]:
         legend = axes.legend(fontsize=figures.SMALL_TEXT_PT, frameon=False)
@@ -126,13 +127,13 @@ def _summary(front: Mapping[str, Any], seconds: NDArray[Any], error: NDArray[Any
     return f"{text}, knee at {seconds[bend]:.3g} s, error {error[bend]:.3g}"
 
 
-def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
+def _set_up_axes(axes: Any, title: str, document: Mapping[str, Any]) -> None:
     """Set log scales, title and axis labels."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     figures.format_log_axes(axes.xaxis, axes.yaxis)
-    axes.set_xlabel("median seconds per warm call")
-    axes.set_ylabel("\n".join(textwrap.wrap(error_name, 36)))
+    axes.set_xlabel(document.get("seconds_name", SECONDS_NAME))
+    axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     axes.set_title(title, fontsize=10)
 
 
@@ -189,6 +190,6 @@ def plot_compared_fronts(
         (s0, e0), (s1, e1) = positions[0][knobs], positions[1][knobs]
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
     axes.margins(x=0.15, y=0.2)
-    _set_up_axes(axes, stage, a[1]["error_name"])
+    _set_up_axes(axes, stage, a[1])
     axes.legend(fontsize=figures.SMALL_TEXT_PT, frameon=False)
     return figures.to_svg(figure, f"{stage}: {'; '.join(summaries)}")

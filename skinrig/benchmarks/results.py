@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 Knob = str | int | float | bool
 Knobs = dict[str, Knob]
+
+SECONDS_NAME: Final = "median seconds per warm call"
+"""Meaning of the seconds of most stages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +149,8 @@ class StageBenchmark:
     """Population over which errors vary within their intervals."""
     squared: bool = False
     """Whether errors and bounds are squares (variances), not sizes."""
+    seconds_name: str = SECONDS_NAME
+    """Meaning of the seconds, for the axis of the plot."""
 
     @property
     def reference_error_means(self) -> str:

@@ -8,7 +8,15 @@ from importlib import resources
 from typing import Any
 
 from skinrig.benchmarks.measurement import Made, measure_and_keep, measure_once
-from skinrig.benchmarks.results import ErrorEstimate, Knob, Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import (
+    SECONDS_NAME,
+    ErrorEstimate,
+    Knob,
+    Limit,
+    Point,
+    StageBenchmark,
+    Timing,
+)
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 STAGES_TABLE = resources.files("skinrig").joinpath("data/benchmarks.toml")
@@ -140,6 +148,7 @@ class BenchmarkStage:
             tuple(entry.get("condition", ())),
             entry["interval_of"],
             entry.get("squared", False),
+            entry.get("seconds_name", SECONDS_NAME),
         )
 
     def _limit(self, table: Mapping[str, Mapping[str, Any]], key: str | tuple[Any, ...]) -> Limit:

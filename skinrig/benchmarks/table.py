@@ -29,6 +29,14 @@ BAND_COLUMNS = (
 )
 """Columns of the errors by band; "over lightest" is the error over that of the lightest band."""
 
+KNEE_COLUMNS = ("stage", "curve", "points", "knee", "seconds", "error")
+"""Columns of the knees of curves of error against seconds."""
+
+MIN_KNEE_POINTS = 3
+"""Fewest points of a curve that can have a knee."""
+
+NO_KNEE = "none: the error decreases up to the longest time"
+
 FRONT_MEANS = (
     "Pareto front: no other setting is both faster and more accurate; knee: more time beyond it "
     "improves the error least"
@@ -120,6 +128,26 @@ def list_band_rows(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
                     stage["error_name"],
                 )
             )
+    return rows
+
+
+def list_knee_rows(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
+    """Return rows of :data:`KNEE_COLUMNS`: the knee of each condition with 3 points or more."""
+    rows: list[tuple[object, ...]] = []
+    for name, stage in document["stages"].items():
+        for front in stage["fronts"]:
+            condition = front["condition"]
+            of_it = [p for p in stage["points"] if condition.items() <= p["knobs"].items()]
+            if len(of_it) < MIN_KNEE_POINTS:
+                continue
+            curve = (name, format_knobs({"knobs": condition}), len(of_it))
+            if front["knee"] is None:
+                rows.append((*curve, NO_KNEE, "", ""))
+                continue
+            bend = stage["points"][front["knee"]]
+            effort = {k: v for k, v in bend["knobs"].items() if k not in condition}
+            setting = format_knobs({"knobs": effort})
+            rows.append((*curve, setting, bend["seconds"], bend["error"]))
     return rows
 
 

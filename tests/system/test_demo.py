@@ -49,7 +49,8 @@ def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmar
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
     monkeypatch.setattr("skinrig.reporting.report.build", lambda *_, **__: "<html></html>")
-    monkeypatch.setattr("skinrig.demo.fuse_person", lambda _, rigs: ran.append(f"fuse {rigs}"))
+    fuse = lambda _, rigs, errors: ran.append(f"fuse {rigs}")  # noqa: E731
+    monkeypatch.setattr("skinrig.demo.fuse_person", fuse)
     for asked, expected in (
         (["dome"], ["dome"]),
         (["flash"], ["flash"]),

@@ -33,7 +33,7 @@ from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import InterreflectionSettings, interreflection_for
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import observe_skin
 from rigsim.light.olat import CameraSettings, Hits
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
@@ -134,9 +134,11 @@ class DomeScene(FaceScene):
         scenery = self._scenery(rig.views[0], self._geometry, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
         sampled = sample_led_light(rig, self.subject, self._caster)
+        self._skins = self._observe()  # what the rules compute of the skin is reused
         seen = (scenery, white, sampled, movement, motion)
         self.needs = select_dome_effects(rig, self.subject, state, *seen)
         self.subject = select_face_tissue(self.subject, self.needs)
+        self._skins = self._observe()
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
@@ -160,7 +162,7 @@ class DomeScene(FaceScene):
     @cached_method
     def _scattering(self, camera: str) -> LateralScattering:
         """Return the lateral scattering of the face for a camera's colors."""
-        skin = ObservedSkin(self._face(), "neutral", camera, self._illuminant)
+        skin = observe_skin(self._face(), "neutral", camera, self._illuminant)
         bounces = None
         if self.interreflections:
             spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)

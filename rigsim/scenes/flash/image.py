@@ -11,7 +11,7 @@ from capture.rig import Rig, View
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture, sample
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import observe_skin
 from rigsim.light.subsurface_radiance import SubsurfaceRadiance, scatter_through_pigment
 from rigsim.mitsuba.render_error import RenderError
 from rigsim.render.depth_of_field import DefocusKernels, LensImage, depth_before_focus
@@ -155,7 +155,7 @@ class FlashCamera:
             Textures of shape (N, N[, 3]).
         """
         camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
-        skin = ObservedSkin(subject, state, camera, light)
+        skin = observe_skin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
         if glow.pigment is None:
             raise ValueError("glow: got one without lateral scattering, expected one with it")
@@ -268,7 +268,8 @@ def _blur_through_lens(
 def _average(parts: ImageLayers, hits: CameraHits) -> tuple[ImageLayers, Float32Array]:
     """Average over pixels: light over the whole pixel, maps over its covered part."""
     coverage = hits.coverage()
-    out = _split(hits.average(_joined(parts)), parts)
+    # layer by layer: all layers together would be a copy of 200 bytes for each ray
+    out = {name: hits.average(part) for name, part in parts.items()}
     for name in out.keys() & set(_LIGHT_NAMES):
         out[name] *= coverage.reshape(*hits.shape, *[1] * (out[name].ndim - 2))
     if "normals" in out:

@@ -26,7 +26,7 @@ from rigsim.caching import cached_method
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import InterreflectionSettings, interreflection_for
 from rigsim.light.lateral import edge_width_mm
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import ObservedSkin, observe_skin
 from rigsim.light.subsurface_radiance import (
     SubsurfaceRadiance,
     SurfaceIllumination,
@@ -135,8 +135,10 @@ class FlashScene(FaceScene):
         self.variant = self._caster.choice
         """Variant that renders the images, with the reason."""
         self._effects, self._power = effects, power
+        self._skins = self._observe()  # what the rules compute of the skin is reused
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.subject = select_face_tissue(self.subject, self.needs)
+        self._skins = self._observe()
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
@@ -338,7 +340,7 @@ class FlashScene(FaceScene):
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
         camera = self._camera(view_name).spectral_sensitivity
-        skin = ObservedSkin(self._face("skin"), self.state, camera, self._illuminant)
+        skin = observe_skin(self._face("skin"), self.state, camera, self._illuminant)
         return edge_width_mm((kernels := skin.lateral_kernels()).sigmas_mm, kernels.weights)
 
     def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
@@ -359,7 +361,7 @@ class FlashScene(FaceScene):
     @cached_method
     def _skin_glow(self, camera: str) -> SubsurfaceRadiance:
         face = self._face("skin")
-        skin = ObservedSkin(face, self.state, camera, self._illuminant)
+        skin = observe_skin(face, self.state, camera, self._illuminant)
         surface, bounces = self._surface_light(face), self._bounces(skin)
         return render_subsurface_radiance(
             skin, surface, lateral_transport=self.lateral, interreflection=bounces

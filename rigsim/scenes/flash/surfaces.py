@@ -126,10 +126,12 @@ class CameraHits:
         return out.reshape(self.shape)
 
     def average(self, rows: Float32Array) -> Float32Array:
-        """Average hits, (n, C), over each pixel's covered part, shape (H, W, C); zero elsewhere."""
-        out = np.zeros((self.shape[0] * self.shape[1], rows.shape[1]), np.float32)
-        _average_hits(np.ascontiguousarray(rows, np.float32), self.pixel, self.first, out)
-        return out.reshape(*self.shape, rows.shape[1])
+        """Average hits over each pixel's covered part: (n, ...) to (H, W, ...); zero elsewhere."""
+        inner = rows.shape[1:]
+        flat = np.ascontiguousarray(rows, np.float32).reshape(len(rows), math.prod(inner))
+        out = np.zeros((self.shape[0] * self.shape[1], flat.shape[1]), np.float32)
+        _average_hits(flat, self.pixel, self.first, out)
+        return out.reshape(*self.shape, *inner)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

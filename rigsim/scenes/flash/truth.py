@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array
-from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.observed_skin import observe_skin
 from rigsim.light.subsurface_radiance import inner_albedo
 from rigsim.population.population import MAX_SKIN_HAIR
 from rigsim.scenes.flash.image import FlashCamera, FlashImage
@@ -133,7 +133,7 @@ def face_surface(
         ``white_rgb``: as given.
     """
     camera, illuminant = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
-    skin = ObservedSkin(face, state, camera, illuminant)
+    skin = observe_skin(face, state, camera, illuminant)
     return {
         "vertices_mm": face.mesh.vertices_mm,
         "faces": face.mesh.faces,

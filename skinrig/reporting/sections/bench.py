@@ -48,6 +48,10 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     ]
     yield page.Plots(plots)
     yield page.build_view("benchmark", stages=document["stages"])
+    if knees := bench_table.list_knee_rows(document):
+        yield page.build_table(
+            bench_table.KNEE_COLUMNS, knees, caption="Knees of the curves of error against seconds"
+        )
     bands = bench_table.list_band_rows(document)
     if bands:
         yield page.build_table(

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy import special
 
 from model import metrics
 
@@ -46,3 +47,19 @@ def test_median_interval_shrinks_with_root_of_count(rng):
         return high - low
 
     assert 3.0 < width(200) / width(20_000) < 30.0
+
+
+@pytest.mark.parametrize(("inside", "count"), [(0, 9), (1, 9), (9, 9), (680, 1000)])
+def test_interval_of_coverage_is_exact_binomial(inside, count):
+    error = np.where(np.arange(count) < inside, 0.0, 2.0)
+    low, high = metrics.coverage(error, np.ones(count), np.zeros(count)).interval
+    # the tails of the binomial distribution, summed term by term
+    k = np.arange(count + 1)
+    of_them = special.gammaln(count + 1) - special.gammaln(k + 1) - special.gammaln(count - k + 1)
+
+    def probability(chance, chosen):
+        logs = of_them + special.xlogy(k, chance) + special.xlog1py(count - k, -chance)
+        return np.exp(logs[chosen]).sum()
+
+    assert probability(low, k >= inside) == pytest.approx(0.025 if inside else 1.0, rel=1e-6)
+    assert probability(high, k <= inside) == pytest.approx(0.025 if inside < count else 1.0)

@@ -1,13 +1,18 @@
 """Whole captures: ratios of forecasts, limits, and the choice of a rig."""
 
+import json
+
 import pytest
 
 from capture.plan import flash_plan
 from capture.rig import load_rig
 from skinrig.benchmarks import end_to_end
+from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.stage import BenchmarkStage
+from skinrig.benchmarks.table import NO_KNEE, list_knee_rows
 from skinrig.cli import main
 from skinrig.planning import confirmation, plans
+from skinrig.reporting import report
 
 BUDGETS_S = (20.0, 40.0, 80.0, 160.0)
 
@@ -32,7 +37,7 @@ def measured_case(error_factors, time_factor):
 
 def run(monkeypatch, error_factors, time_factor=1.0):
     monkeypatch.setattr(
-        end_to_end, "_measure_case", lambda *_: measured_case(error_factors, time_factor)
+        end_to_end, "_measure_case", lambda *_: [measured_case(error_factors, time_factor)]
     )
     stage = BenchmarkStage("end-to-end", selection="flash")
     list(end_to_end.measure_end_to_end(stage))
@@ -73,6 +78,36 @@ def test_points_hold_total_seconds_and_mean_error(monkeypatch):
     assert first.extra_values["people"] == 2
     assert first.extra_values["inside the forecast's interval"] == 1
     assert first.extra_values["capture, s"] == pytest.approx(0.5 * BUDGETS_S[0])
+
+
+@pytest.mark.parametrize("is_flat", [True, False])
+def test_knee_of_each_curve_is_in_report(monkeypatch, tmp_path, is_flat):
+    points = measured_case((0.5, 1.5), 1.0)
+    if is_flat:  # from 80 s on; before, the error is inverse to the seconds
+        points[64, 160.0].measured = points[64, 80.0].measured
+    monkeypatch.setattr(end_to_end, "_measure_case", lambda *_: [points])
+    stage = BenchmarkStage("end-to-end", selection="flash")
+    list(end_to_end.measure_end_to_end(stage))
+    document = to_document([stage.to_benchmark()])
+    ((name, curve, count, knee, *_),) = list_knee_rows(document)
+    assert (name, curve, count) == ("end-to-end", "rig=flash map=melanin", len(BUDGETS_S))
+    assert knee == ("width=64 budget_s=80.0" if is_flat else NO_KNEE)
+    document["stages"][name]["size"] = "full"
+    (tmp_path / "bench.json").write_text(json.dumps(document))
+    page = report.build([tmp_path / "bench.json"])
+    assert f">{knee}<" in page
+    assert "seconds from planning to maps" in page
+
+
+def test_interrupted_run_keeps_persons_measured_before(monkeypatch):
+    one, two = measured_case((0.5,), 1.0), measured_case((0.5, 1.5), 1.0)
+    monkeypatch.setattr(end_to_end, "_measure_case", lambda *_: iter([one, two]))
+    stage = BenchmarkStage("end-to-end", selection="flash")
+    people = [
+        [point.extra_values["people"] for point in stage.points]
+        for _ in end_to_end.measure_end_to_end(stage)
+    ]
+    assert people == [[1] * len(BUDGETS_S), [2] * len(BUDGETS_S)]
 
 
 def test_calibration_is_of_persons_own_rig(monkeypatch):

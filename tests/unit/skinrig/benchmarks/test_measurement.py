@@ -30,6 +30,18 @@ def test_two_points_have_no_knee():
     assert find_knee((point(1, 2), point(2, 1))) is None
 
 
+def test_flat_curve_has_knee_at_quickest_point():
+    wide = Point({"n": 1}, Timing(3.0, (3.0, 3.0), 3.0, 1.0), 0.9, (0.7, 1.1))
+    assert find_knee((point(1, 1), point(2, 1.2), wide)) == 0
+    assert find_knee((point(1, 1), point(2, 1), point(3, 1))) == 0
+
+
+def test_curve_without_bend_ends_before_useless_time():
+    steep = (point(1, 8), point(2, 7), point(3, 1))  # above the chord between its ends
+    assert find_knee(steep) is None
+    assert find_knee((*steep, point(9, 2))) == 2
+
+
 def test_first_call_is_timed_separately_from_warm_ones():
     calls = []
     timing = measure(lambda: calls.append(1), repeats=4)
@@ -125,7 +137,7 @@ def test_each_condition_has_own_front_and_knee():
     written = to_document([alone])["stages"]["s"]
     assert written["fronts"] == [
         {"condition": {"noise": "low"}, "points": [0, 1, 2], "knee": 1},
-        {"condition": {"noise": "high"}, "points": [3, 4], "knee": None},
+        {"condition": {"noise": "high"}, "points": [3, 4], "knee": 4},
     ]
     assert [p["on_front"] for p in written["points"]] == [True] * 5 + [False]
     # in one front for all, what is measured with much noise would look like too little effort
