@@ -49,7 +49,10 @@ def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmar
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
     monkeypatch.setattr("skinrig.reporting.report.build", lambda *_, **__: "<html></html>")
-    fuse = lambda _, rigs, errors: ran.append(f"fuse {rigs}")  # noqa: E731
+
+    def fuse(run, rigs, errors):
+        ran.append(f"fuse {rigs}")
+
     monkeypatch.setattr("skinrig.demo.fuse_person", fuse)
     for asked, expected in (
         (["dome"], ["dome"]),
