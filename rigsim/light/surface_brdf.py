@@ -41,7 +41,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads, njit, prange
 from numpy.typing import ArrayLike
 
 from rigsim import shading
