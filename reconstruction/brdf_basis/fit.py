@@ -305,12 +305,14 @@ def reduce(
     return found, mix, float(np.sqrt(max(squared[0], 0.0) / squared[1]))
 
 
-def _factor(data: Float64Array, rank: int, seed: int) -> tuple[Float64Array, Float64Array]:
+def _factor(
+    data: Float64Array, rank: int, seed: int, rounds: int = 400
+) -> tuple[Float64Array, Float64Array]:
     # imported here: most commands that load this module factor nothing, and it takes 0.4 s
     from sklearn.decomposition import NMF
     from sklearn.exceptions import ConvergenceWarning
 
-    model = NMF(rank, init="nndsvda", solver="cd", max_iter=400, tol=1e-3, random_state=seed)
+    model = NMF(rank, init="nndsvda", solver="cd", max_iter=rounds, tol=1e-3, random_state=seed)
     with warnings.catch_warnings():
         # A factorization stopped early is valid but slightly worse; its error includes that
         warnings.simplefilter("ignore", ConvergenceWarning)
