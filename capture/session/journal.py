@@ -376,8 +376,9 @@ def _is_torn(text: bytes, *, unended: bool, last: bool, head: str) -> bool:
     """Return whether a bad line looks like the truncated end of an interrupted write.
 
     An interrupted write leaves a prefix of its lines, zeros, a prefix and zeros, or a hole of zeros
-    before further lines. A flipped bit leaves at most one zero byte, and a line whose newline was
-    hit is one byte longer than a whole record: these are damage to an acknowledged line.
+    before further lines of its own. A flipped bit leaves at most one zero byte, and a line whose
+    newline was hit is one byte longer than a whole record: these are damage to an acknowledged
+    line.
 
     Parameters
     ----------
