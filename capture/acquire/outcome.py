@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3
 MAX_GROUP_BYTES = 2**26
-"""Largest size of frames that are encoded and written together, but for a single one."""
+"""Largest size of pixels that are encoded and written together, but for a single frame."""
 
 
 class AcquisitionError(DeviceError, RuntimeError):
@@ -196,7 +196,7 @@ class CaptureRun:
             Number of attempts until all cameras had a frame.
         t_box_s
             Time of the cameras' release, on the controller's clock; None without a controller.
-        noted
+        journal_entries
             Further journal entries of the frames.
         """
         # a step of which only some cameras were kept is repeated with all of them
@@ -216,8 +216,8 @@ class CaptureRun:
                 attempt=attempts[name],
             )
 
-        images = [frame.image for frame in frames.values()]
-        largest = max(len(one) if isinstance(one, bytes) else one.nbytes for one in images)
+        views = [self.rig.view(name) for name in frames]
+        largest = max((2 * view.width_px * view.height_px for view in views), default=1)
         names, count = list(frames), max(1, MAX_GROUP_BYTES // largest)
         for group in (names[k : k + count] for k in range(0, len(names), count)):
             self.session.commit_step(step.id, starmap(encode, enumerate(group)))

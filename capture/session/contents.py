@@ -109,8 +109,8 @@ def read_contents(path: Path, *, sealing: bool = False) -> SessionContents:
     _require_folder(path / FRAMES_FOLDER)
     if os.path.lexists(path / ATTACHMENTS_FOLDER):  # made with the first attachment
         _require_folder(path / ATTACHMENTS_FOLDER)
-    most = manifest.plan.max_cameras
-    walked = walk_journal(journal, seal=seal, where=str(where), max_group=most)
+    cameras = {step.id: len(step.cameras) for step in manifest.plan.steps}
+    walked = walk_journal(journal, seal=seal, where=str(where), cameras=cameras)
     if walked.damage is None:
         walked = _check_against_plan(walked, manifest, str(where))
     return SessionContents(manifest, walked, consent_seal)

@@ -6,8 +6,10 @@ Reading needs no such care: it is one function.
 import fcntl
 import os
 import stat
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
 
@@ -75,12 +77,41 @@ class Disk:
     def for_each(self, work: Callable[[ItemT], object], items: Iterable[ItemT]) -> None:
         """Do work for each item on threads, while this one makes the next items.
 
-        After an error, no further item is begun. It returns, or raises the first error, once no
-        work is left. A model of the disk does one after the other.
+        After an error of the work or of the items, no further item is begun and no further one is
+        made. It returns, or raises the work's first error or else the items' error, once no thread
+        works any more. This thread does the work itself where no further thread can start. A model
+        of the disk does one after the other.
         """
-        with ThreadPoolExecutor(N_WRITERS) as pool:
-            for _ in pool.map(work, items):
-                pass
+        failed: list[BaseException] = []
+        stopped = threading.Event()
+
+        def do_once(item: ItemT, begun: threading.Lock) -> None:
+            if not stopped.is_set() and begun.acquire(blocking=False):
+                try:
+                    work(item)
+                except BaseException as exc:
+                    failed.append(exc)
+                    stopped.set()
+
+        pool = ThreadPoolExecutor(N_WRITERS)
+        try:
+            for item in items:
+                task = partial(do_once, item, threading.Lock())
+                try:
+                    pool.submit(task)
+                except RuntimeError:  # no thread could start; one that runs may take it, too
+                    task()
+                if stopped.is_set():
+                    break
+            _end_pool(pool)
+        except BaseException as exc:
+            stopped.set()
+            _end_pool(pool)
+            if not failed:
+                raise
+            raise failed[0] from exc
+        if failed:
+            raise failed[0]
 
     def fsync_dir(self, path: Path) -> None:
         """Flush the names in a directory to the medium."""
@@ -105,6 +136,15 @@ class Disk:
         except BlockingIOError:
             return False
         return True
+
+
+def _end_pool(pool: ThreadPoolExecutor) -> None:
+    """Wait for all threads; another Ctrl-C ends no wait, so that none writes afterwards."""
+    try:
+        pool.shutdown()
+    except BaseException:
+        _end_pool(pool)
+        raise
 
 
 def read_file(

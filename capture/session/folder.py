@@ -22,7 +22,7 @@ from capture.session.contents import (
     read_contents,
     unlisted_files,
 )
-from capture.session.disk import Blob, Disk, read_file
+from capture.session.disk import Blob, Disk, ItemT, read_file
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
 _log = logging.getLogger(__name__)
@@ -56,7 +56,11 @@ class DiskErrors:
 
 def write_new(disk: Disk, path: Path, data: Blob) -> None:
     """Write a new file and flush its data; the caller flushes its name."""
-    descriptor = disk.create(path)
+    _fill(disk, disk.create(path), data)
+
+
+def _fill(disk: Disk, descriptor: int, data: Blob) -> None:
+    """Write a new file, flush its data, and close it."""
     try:
         disk.write(descriptor, data)
         disk.fsync(descriptor)
@@ -64,13 +68,29 @@ def write_new(disk: Disk, path: Path, data: Blob) -> None:
         disk.close(descriptor)
 
 
+def note_errors(items: Iterable[ItemT], noted: list[BaseException]) -> Iterator[ItemT]:
+    """Yield items; append the error that ends them to ``noted``, and raise it."""
+    try:
+        yield from items
+    except BaseException as exc:
+        noted.append(exc)
+        raise
+
+
 def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
     """Write new files of one folder, several at once, and flush their data, then their names.
 
-    Files are written while further ones are made. After an error, no file of the group is left
-    unless the disk refuses that, too; a file that was there before is not removed.
+    Files are written while further ones are made. After an error, files of the group that have no
+    name yet are removed unless the disk refuses that, too; a file that was there before is kept.
     """
     parts: dict[Path, Path] = {}
+    created: list[Path] = []
+
+    def write_part(file: tuple[Path, Blob]) -> None:
+        part, blob = file
+        descriptor = disk.create(part)
+        created.append(part)
+        _fill(disk, descriptor, blob)
 
     def name_parts() -> Iterator[tuple[Path, Blob]]:
         for path, blob in files:
@@ -79,11 +99,9 @@ def write_group(disk: Disk, files: Iterable[tuple[Path, Blob]]) -> None:
             yield part, blob
 
     try:
-        disk.for_each(lambda file: write_new(disk, *file), name_parts())
-    except FileExistsError:  # resuming sets all aside
-        raise
+        disk.for_each(write_part, name_parts())
     except BaseException:
-        for part in parts:
+        for part in created:
             with suppress(OSError):  # the first error is the cause
                 disk.remove(part)
         raise

@@ -9,7 +9,7 @@ be the last.
 import hashlib
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import xxhash
@@ -33,6 +33,12 @@ from capture.session.errors import SessionDamage, SessionError
 MAX_LINE_BYTES = 65_536
 ATTACHMENT_RULE = f"{ID_RULE}, not ending in .part"
 _XXH128_PATTERN = re.compile(r"[0-9a-f]{32}")
+_HEAD_PATTERN = re.compile(rb'\{"h":"([0-9a-f]{64})","r":(?:\{"([a-z]+)")?')
+"""Beginning of a line: its hash, and the first key of its record."""
+_KIND_PATTERN = re.compile(rb'"type":"([a-z_]+)"(?:,"xxh128":|\}\}\n)')
+_FILE_PATTERN = re.compile(rb'"file":"frames/([\w.-]+)\+([\w.-]+)(?:\+\d+)?\.dng"')
+_STEP_PATTERN = re.compile(rb'"step":"([\w.-]+)","t_box_s":')
+_LINE_PATTERN = re.compile(rb"[^\n]*\n|[^\n]+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,6 +170,10 @@ _LINE_KINDS: Mapping[str, type[Any]] = {
     "omission": OmissionLine,
     "close": CloseLine,
 }
+_FIRST_KEYS = {
+    kind.encode(): min(one.name for one in fields(known)).encode()
+    for kind, known in _LINE_KINDS.items()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,15 +253,18 @@ def seal_bounded_line(previous: str, line: Line) -> tuple[bytes, str]:
     return text, head
 
 
-def walk_journal(data: bytes, *, seal: str, where: str, max_group: int = 1) -> JournalWalk:
+def walk_journal(
+    data: bytes, *, seal: str, where: str, cameras: Mapping[str, int] | None = None
+) -> JournalWalk:
     """Follow the chain from ``seal`` to the last line, truncated lines, or the first damage.
 
     Parameters
     ----------
     data, seal, where
         The journal, the seal of its manifest, and its name for messages.
-    max_group
-        Largest number of lines written at once.
+    cameras
+        Number of cameras by step: the lines of a step's frames are written at once. None: each line
+        was written alone.
     """
     lines: list[tuple[int, Line]] = []
     head, start = seal, 0
@@ -266,8 +279,8 @@ def walk_journal(data: bytes, *, seal: str, where: str, max_group: int = 1) -> J
         try:
             line, digest = _unseal(text, head, f"{where}, byte {start}")
         except SessionDamage as exc:
-            left = data.count(b"\n", start) + (not data.endswith(b"\n"))
-            if _is_torn(text, unended=stop < 0, last=left <= max_group, head=head):
+            last = _is_one_write(text, data[start + len(text) :], cameras or {})
+            if _is_torn(text, unended=stop < 0, last=last, head=head):
                 return JournalWalk(tuple(lines), head, start, len(data) - start, None)
             return JournalWalk(tuple(lines), head, start, 0, exc)
         if line is None:  # complete but for its newline: was never acknowledged
@@ -307,12 +320,65 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
     )
 
 
+def _is_one_write(text: bytes, behind: bytes, cameras: Mapping[str, int]) -> bool:
+    """Return whether a bad line and all behind it may be of one write.
+
+    That is one line, or lines of frames of one step, each of another camera. What a hole covers is
+    unknown: all that is left must fit.
+
+    Parameters
+    ----------
+    text
+        The bad line; a hole may have joined several.
+    behind
+        All behind its newline.
+    cameras
+        Number of cameras by step.
+    """
+    rest = text + behind
+    files = _FILE_PATTERN.findall(rest)
+    views = [camera for _, camera in files]
+    steps = {step for step, _ in files} | set(_STEP_PATTERN.findall(rest))
+    kinds, begin = _KIND_PATTERN.findall(rest), _HEAD_PATTERN.match(text)
+    first_key = begin[2] if begin else None
+    several = bool(behind) or len(kinds) > 1
+    if any(first_key not in (None, _FIRST_KEYS.get(kind, first_key)) for kind in kinds):
+        return False
+    if len(steps) > 1 or len(set(views)) < len(views) or (several and set(kinds) - {b"frame"}):
+        return False
+    if not behind:
+        return True
+    if first_key not in (None, b"actual"):
+        return False
+    before, count = text, 1
+    for line in _LINE_PATTERN.findall(behind):
+        count += 1
+        if line.endswith(b"\n") and line.count(b"\0") < 2:
+            if not _KIND_PATTERN.search(line):
+                return False
+            if _HEAD_PATTERN.match(before) and not _is_next(before, line):
+                if before is not text:
+                    return False
+                count += 1  # the hole has joined two lines at least
+        before = line
+    most = max(cameras.values(), default=1)
+    return count <= min((cameras.get(step.decode(), 0) for step in steps), default=most)
+
+
+def _is_next(before: bytes, line: bytes) -> bool:
+    """Return whether a line's hash follows from its record and from the hash of the line before."""
+    record = line[76:-2]
+    digest = hashlib.sha256(before[6:70] + record).hexdigest()
+    return line == b'{"h":"' + digest.encode("ascii") + b'","r":' + record + b"}\n"
+
+
 def _is_torn(text: bytes, *, unended: bool, last: bool, head: str) -> bool:
     """Return whether a bad line looks like the truncated end of an interrupted write.
 
     An interrupted write leaves a prefix of its lines, zeros, a prefix and zeros, or a hole of zeros
-    before further lines. A flipped bit leaves at most one zero byte, and a line whose newline was
-    hit is one byte longer than a whole record: these are damage to an acknowledged line.
+    before further lines of its own. A flipped bit leaves at most one zero byte, and a line whose
+    newline was hit is one byte longer than a whole record: these are damage to an acknowledged
+    line.
 
     Parameters
     ----------

@@ -17,12 +17,13 @@ from capture.plan import Plan, Value
 from capture.rig import Rig
 from capture.session.contents import JOURNAL_FILE, SessionContents, read_undamaged_contents
 from capture.session.disk import Blob, Disk
-from capture.session.errors import SessionDiskError, SessionError, SessionLocked
+from capture.session.errors import SessionError, SessionLocked
 from capture.session.folder import (
     DiskErrors,
     make_attachments_folder,
     make_folder,
     move_orphans,
+    note_errors,
     write_group,
 )
 from capture.session.journal import (
@@ -230,18 +231,15 @@ class Session(SessionView):
         SessionDiskError
             When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
-        descriptor = self._writable()
-        lines: dict[str, FrameLine] = {}
 
         def check() -> Iterator[tuple[FrameLine, Blob]]:
+            seen: set[str] = set()
             for frame in frames:
-                self._check_commit(step_id, frame, others=lines)
-                lines[frame.camera] = frame.line(step_id)
-                yield lines[frame.camera], frame.blob
+                self._check_commit(step_id, frame, others=seen)
+                seen.add(frame.camera)
+                yield frame.line(step_id), frame.blob
 
-        self._write(descriptor, check())
-        for line in lines.values():
-            self._lines.setdefault((step_id, line.camera), []).append(line)
+        self._write(self._writable(), check())
 
     def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
         """Attach a file other than a frame; when this returns, it survives a power cut.
@@ -285,7 +283,6 @@ class Session(SessionView):
             with self._released_on_failure():
                 make_attachments_folder(self._disk, self.path)
         self._write(descriptor, [(line, bytes(data))])
-        self._attached[name] = line
 
     def omit_steps(
         self,
@@ -336,37 +333,46 @@ class Session(SessionView):
         text, head = seal_bounded_line(self._head, line)
         with self._released_on_failure():
             self._append(descriptor, text)
-        self._head = head
-        self._left_out.update(dict.fromkeys(line.steps, line))
+            self._head = head
+            self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(
         self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
     ) -> None:
         """Write files of one folder, and then their lines of the journal, to the medium."""
         text, head = b"", self._head
+        lines: list[FrameLine | AttachmentLine] = []
+        refused: list[BaseException] = []
 
         def seal() -> Iterator[tuple[Path, Blob]]:
             nonlocal text, head
             for line, blob in files:
                 sealed, head = seal_bounded_line(head, line)
                 text += sealed
+                lines.append(line)
                 yield self.path / line.file, blob
 
-        with self._released_on_failure():
-            write_group(self._disk, seal())
+        with self._released_on_failure(refused):
+            write_group(self._disk, note_errors(seal(), refused))
             if text:
                 self._append(descriptor, text)
-        self._head = head
+            self._head = head
+            for line in lines:
+                if isinstance(line, AttachmentLine):
+                    self._attached[line.name] = line
+                else:
+                    self._lines.setdefault((line.step, line.camera), []).append(line)
 
     @contextmanager
-    def _released_on_failure(self) -> Iterator[None]:
-        """Release the session when the disk refuses."""
+    def _released_on_failure(self, refused: Sequence[BaseException] = ()) -> Iterator[None]:
+        """Release the session after any error or stop, except the caller's errors ``refused``."""
         try:
-            with DiskErrors(self.path):
-                yield
-        except SessionDiskError:
-            # how much reached the medium is unknown: only resume() can find out
-            self.release()
+            yield
+        except BaseException as exc:
+            if exc not in refused:
+                self.release()  # only resume() can find out how much reached the medium
+                with DiskErrors(self.path):
+                    raise
             raise
 
     def close(self, *, missing_reason: str = "") -> None:
@@ -393,11 +399,9 @@ class Session(SessionView):
         frames = sum(len(lines) for lines in self._lines.values())
         line = CloseLine(frames=frames, missing=missing, reason=missing_reason if missing else "")
         text, head = seal_bounded_line(self._head, line)
-        try:
-            with DiskErrors(self.path):
-                self._append(descriptor, text)
+        with self._released_on_failure():
+            self._append(descriptor, text)
             self._head, self._close_line = head, line
-        finally:
             self.release()
 
     def release(self) -> None:

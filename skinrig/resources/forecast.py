@@ -209,7 +209,7 @@ def temporary_room_mb(need: ResourceForecast, out: Path) -> float:
 
 def describe_disk(need: ResourceForecast, out: Path) -> str:
     """Describe the space that an output and a temporary file take, and whether the file fits."""
-    text = f"disk: about {_gb(need.disk_mb)}"
+    text = f"disk: about {_gb(max(0.0, need.disk_mb))}"
     if need.temporary_mb:
         text += f", and up to {_gb(need.temporary_mb)} of temporary images until the end"
         room_mb = temporary_room_mb(need, out)

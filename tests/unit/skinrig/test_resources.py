@@ -139,6 +139,13 @@ COMMANDS = {
 }
 
 
+@pytest.mark.parametrize(("disk_mb", "text"), [(-300.0, "0"), (300.0, "0.3")])
+def test_disk_of_session_with_files_is_positive(tmp_path, disk_mb, text):
+    """A resumed session may have more files than the forecast counts."""
+    need = ResourceForecast(1.0, 1.0, disk_mb)
+    assert resources.describe_disk(need, tmp_path) == f"disk: about {text} GB"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_lack_of_memory_is_refused_first(name, tmp_path, free, monkeypatch, capsys):
     for begun in ("rigsim.population.files.load_subject", "skinrig.demo._make_room"):

@@ -10,6 +10,7 @@ import os
 import stat
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -95,19 +96,102 @@ def test_work_is_done_by_several_threads_at_once():
 
 def test_error_of_work_begins_no_further_item():
     """It is raised once no thread writes any more: the caller may then release the session."""
-    begun, ended = [], []
+    begun, ended, made = [], [], []
+    together = threading.Barrier(N_WRITERS, timeout=10.0)
+
+    def make():
+        for number in range(1000):
+            made.append(number)
+            yield number
+            if number >= N_WRITERS:
+                time.sleep(0.01)
 
     def work(number):
         begun.append(number)
+        together.wait()
         if number == 0:
             raise OSError(errno.ENOSPC, "full")
-        time.sleep(0.02)
+        time.sleep(0.3)
         ended.append(number)
 
     with pytest.raises(OSError, match="full"):
-        Disk().for_each(work, range(1000))
-    assert sorted(begun[1:]) == sorted(ended)
-    assert len(begun) < 1000
+        Disk().for_each(work, make())
+    assert sorted(begun) == list(range(N_WRITERS))
+    assert sorted(ended) == list(range(1, N_WRITERS))
+    assert len(made) < 10 * N_WRITERS
+
+
+def test_first_error_in_time_is_raised():
+    """Not that of the first item, and not that of the items: the disk's releases the session."""
+    failing = threading.Event()
+
+    def make():
+        yield from (0, 1)
+        failing.wait(10.0)
+        raise ZeroDivisionError("lost")
+
+    def work(number):
+        if number == 0:
+            failing.wait(10.0)
+            time.sleep(0.2)
+        failing.set()
+        raise OSError(errno.EIO, f"item {number}")
+
+    with pytest.raises(OSError, match="item 1"):
+        Disk().for_each(work, make())
+
+
+def test_second_stop_leaves_no_thread_at_work(monkeypatch):
+    """A thread could create a file after the session's lock is released."""
+    begun, released, ended, calls = threading.Event(), threading.Event(), [], []
+    shutdown = ThreadPoolExecutor.shutdown
+
+    def interrupted(pool, **words):
+        calls.append(words)
+        if len(calls) == 1:
+            raise KeyboardInterrupt("second")
+        released.set()
+        shutdown(pool, **words)
+
+    def make():
+        yield 0
+        begun.wait(10.0)
+        raise KeyboardInterrupt("first")
+
+    def work(number):
+        begun.set()
+        released.wait(10.0)
+        ended.append(number)
+
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Disk().for_each(work, make())
+    assert ended == [0]
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+@pytest.mark.parametrize("failing", [False, True])
+def test_work_is_done_where_no_thread_starts(monkeypatch, threads, failing):
+    """A limit of addresses can refuse any thread; each item is done once."""
+    started, done, start = [], [], threading.Thread.start
+
+    def start_some(thread):
+        if len(started) == threads:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    def work(number):
+        done.append(number)
+        time.sleep(0.005)
+        if failing and number == 3:
+            raise OSError(errno.EIO, "refused")
+
+    monkeypatch.setattr(threading.Thread, "start", start_some)
+    with pytest.raises(OSError, match="refused") if failing else contextlib.nullcontext():
+        Disk().for_each(work, range(20))
+    assert len(set(done)) == len(done)
+    assert len(done) < 10 if failing else sorted(done) == list(range(20))
 
 
 def test_invalid_descriptor_is_refused(tmp_path):

@@ -13,6 +13,7 @@ from capture.session.journal import (
     CloseLine,
     FrameLine,
     OmissionLine,
+    frame_path,
     seal_bounded_line,
     seal_line,
     walk_journal,
@@ -20,6 +21,22 @@ from capture.session.journal import (
 
 SEAL = "0" * 64
 OMITTED = OmissionLine(steps=("S001",), reason="blinked", about={}, t_host_s=1.0)
+END = CloseLine(frames=0, missing=(), reason="")
+VIEWS = ("C00", "C01", "C02")
+CAMERAS = {"S001": 3, "S002": 3, "S003": 1, "S004": 2}
+"""Cameras of each step."""
+
+
+def frame_line(step, camera, attempt=1):
+    return FrameLine(
+        **{"step": step, "camera": camera, "attempt": attempt, "bytes": 9, "xxh128": "0" * 32},
+        **{"file": frame_path(step, camera, attempt), "settings": {"iso": 100}},
+        **{"actual": {"serial": camera}, "t_box_s": None, "t_host_s": 1.0},
+    )
+
+
+def frame_lines(step, views=VIEWS, attempt=1):
+    return [frame_line(step, view, attempt) for view in views]
 
 
 def seal_lines(*lines):
@@ -157,36 +174,84 @@ def test_zeros_after_last_line_are_torn(tail):
 
 
 @pytest.mark.parametrize("kept", [0, 1, 2])
-@pytest.mark.parametrize("lost", ["hole", "end", "zeros"])
-def test_lines_of_one_write_are_torn(kept, lost):
+@pytest.mark.parametrize("lost", ["hole", "end", "zeros", "hole and end"])
+@pytest.mark.parametrize("before", [[OMITTED], frame_lines("S002"), frame_lines("S001")])
+def test_lines_of_one_write_are_torn(kept, lost, before):
     """The lines before are whole, and their files are durable: they count."""
-    texts = seal_lines(*(OMITTED,) * 4)
-    start = sum(map(len, texts[: 1 + kept]))
+    texts = seal_lines(*before, *frame_lines("S001", attempt=2))
+    start = sum(map(len, texts[: len(before) + kept]))
     whole = b"".join(texts)
+    hole = whole[: start + 5] + bytes(len(texts[-1])) + whole[start + 5 + len(texts[-1]) :]
     data = {
-        "hole": whole[: start + 5] + bytes(len(texts[-1])) + whole[start + 5 + len(texts[-1]) :],
-        "end": whole[: start + 5],
+        **{"hole": hole, "hole and end": hole[:-9], "end": whole[: start + 5]},
         "zeros": whole[: start + 5].ljust(len(whole), b"\0"),
     }[lost]
-    walk = walk_journal(data, seal=SEAL, where="journal", max_group=3)
-    assert (len(walk.lines), walk.damage) == (1 + kept, None)
+    walk = walk_journal(data, seal=SEAL, where="journal", cameras=CAMERAS)
+    assert (len(walk.lines), walk.damage) == (len(before) + kept, None)
     assert (walk.end, walk.torn) == (start, len(data) - start)
 
 
-@pytest.mark.parametrize("end", [b"", b'{"h"'])
-def test_hole_before_lines_of_later_writes_is_damage(end):
-    first, second, *later = seal_lines(*(OMITTED,) * 4)
-    data = first + second[:5] + bytes(9) + second[14:] + b"".join(later) + end
-    group = 2 + bool(end)
-    walk = walk_journal(data, seal=SEAL, where="journal", max_group=group)
-    assert walk.damage is not None
-    assert walk_journal(data, seal=SEAL, where="journal", max_group=group + 1).damage is None
+@pytest.mark.parametrize("size", [2, 40, 180, 333, 500, 700])
+def test_hole_anywhere_in_write_is_torn(size):
+    """Also over newlines, beginnings of lines, and names of steps."""
+    before, *texts = seal_lines(OMITTED, *frame_lines("S001"))
+    write = b"".join(texts)
+    for first in range(0, len(write) - size + 1, 3):
+        holed = write[:first] + bytes(size) + write[first + size :]
+        walk = walk_journal(before + holed, seal=SEAL, where="journal", cameras=CAMERAS)
+        assert walk.damage is None, first
+        kept = write[:first].count(b"\n")
+        assert (walk.end, len(walk.lines)) == (len(before + b"".join(texts[:kept])), 1 + kept)
+
+
+LATER_WRITES = {
+    "end": [*frame_lines("S001"), END],
+    "omission": [*frame_lines("S001"), OMITTED],
+    "one camera": [frame_line("S003", "C00"), frame_line("S003", "C00", 2)],
+    "second attempt": [*frame_lines("S001"), *frame_lines("S001", attempt=2)],
+    "second step": [*frame_lines("S002", VIEWS[:2]), *frame_lines("S004", VIEWS[:2])],
+    "step of three": [frame_line("S003", "C00"), *frame_lines("S001")],
+    "omission first": [OMITTED, *frame_lines("S004", VIEWS[:2])],
+}
+
+
+@pytest.mark.parametrize("later", LATER_WRITES)
+@pytest.mark.parametrize("zeros", [2, 9])
+def test_hole_before_later_write_is_damage(later, zeros):
+    """Every line before the last write was acknowledged, wherever the hole in it is."""
+    texts = seal_lines(*LATER_WRITES[later])
+    group = {"end": 1, "omission": 1, "one camera": 1, "step of three": 3, "second attempt": 3}
+    group = group.get(later, 2)
+    whole = b"".join(texts)
+    limit = sum(map(len, texts[:-group]))
+    for first in range(0, limit - zeros, 3):
+        data = whole[:first] + bytes(zeros) + whole[first + zeros :]
+        walk = walk_journal(data, seal=SEAL, where="journal", cameras=CAMERAS)
+        assert walk.damage is not None, (first, limit)
+
+
+@pytest.mark.parametrize("later", ["end", "omission", "second step", "step of three"])
+def test_hole_over_newline_of_two_writes_is_damage(later):
+    texts = seal_lines(*LATER_WRITES[later])
+    group = {"end": 1, "omission": 1, "step of three": 3}.get(later, 2)
+    whole, limit = b"".join(texts), sum(map(len, texts[:-group]))
+    data = whole[: limit - 20] + bytes(60) + whole[limit + 40 :]
+    assert walk_journal(data, seal=SEAL, where="journal", cameras=CAMERAS).damage is not None
+
+
+def test_flipped_bit_behind_hole_is_damage():
+    """The hole is of an interrupted write, the bit is not."""
+    texts = seal_lines(*frame_lines("S001"))
+    holed = texts[0][:90] + bytes(9) + texts[0][99:]
+    for line in (texts[2].replace(b'"iso":100', b'"iso":101'), texts[2][:-2] + b"\r\n"):
+        data = holed + texts[1] + line
+        assert walk_journal(data, seal=SEAL, where="journal", cameras=CAMERAS).damage is not None
 
 
 def test_flipped_bit_within_last_write_is_damage():
-    first, second, third = seal_lines(*(OMITTED,) * 3)
-    data = first + second.replace(b"omission", b"omissiom") + third
-    assert walk_journal(data, seal=SEAL, where="journal", max_group=3).damage is not None
+    first, second, third = seal_lines(*frame_lines("S001"))
+    data = first + second.replace(b"frames", b"frbmes") + third
+    assert walk_journal(data, seal=SEAL, where="journal", cameras=CAMERAS).damage is not None
 
 
 def test_spoiled_newline_is_damage():

@@ -4,9 +4,17 @@ import threading
 from datetime import UTC, date, datetime, timedelta
 
 import pytest
-from fixtures.small_sessions import commit_frame, commit_pending, create_session
+from fixtures.small_sessions import (
+    CAMERAS,
+    DOME,
+    commit_frame,
+    commit_pending,
+    commit_step,
+    create_session,
+    plan_of,
+)
 
-from capture.session import SubjectRecord, verification, verify
+from capture.session import Session, SessionDamage, SubjectRecord, verification, verify
 
 DAY = date(2026, 11, 21)
 
@@ -118,7 +126,7 @@ def test_damaged_journal_reports_no_strays(session):
     journal = session.path / "journal.jsonl"
     journal.write_bytes(journal.read_bytes().replace(b"S000", b"S00x", 1))
     report = verify(session.path, today=DAY)
-    assert ["byte 0: is damaged" in problem for problem in report.problems] == [True]
+    assert ["byte 0: " in problem for problem in report.problems] == [True]
     assert report.frames == 0
 
 
@@ -175,3 +183,25 @@ def test_files_are_checked_at_same_time(session, monkeypatch):
     together = threading.Barrier(verification.N_READERS)
     monkeypatch.setattr(verification, "check_file", lambda *_: together.wait(10.0))
     assert verify(session.path).ok
+
+
+@pytest.mark.parametrize("back", [2, 3, 4])
+@pytest.mark.parametrize("place", [3, 75, 200, -3])
+def test_zeros_in_lines_before_end_are_damage(tmp_path, back, place):
+    """Two zero bytes in a line of the last step; the line of the end is whole."""
+    plan = plan_of(2, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        for step in plan.steps:
+            commit_step(session, step.id)
+        session.close()
+    journal = tmp_path / "s/journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    start = place % len(lines[-back])
+    lines[-back] = lines[-back][:start] + b"\0\0" + lines[-back][start + 2 :]
+    journal.write_bytes(b"".join(lines))
+    (problem,) = verify(tmp_path / "s").problems
+    assert f"journal.jsonl, byte {sum(map(len, lines[:-back]))}: " in problem
+    with pytest.raises(SessionDamage):
+        Session.resume(tmp_path / "s")
+    assert journal.read_bytes() == b"".join(lines)
+    assert list((tmp_path / "s/orphans").iterdir()) == []

@@ -141,20 +141,88 @@ def test_refused_frame_leaves_no_file_of_others(tmp_path):
     assert verify(tmp_path / "s").ok
 
 
-def test_file_that_was_there_before_is_kept(tmp_path):
+@pytest.mark.parametrize("first_error", ["exists", "full", "caller"])
+def test_file_that_was_there_before_is_kept(tmp_path, first_error):
+    """The session's own files are removed, whatever ends the step."""
     plan = plan_of(1, len(CAMERAS))
-    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+    disk = DiskFullAt("C00" if first_error == "full" else "none")
+    with create_session(tmp_path / "s", plan=plan, rig=DOME, disk=disk) as session:
         stray = session.path / "frames/S000+C01.dng.part"
         stray.write_bytes(b"of another program")
-        with pytest.raises(SessionDiskError, match="File exists"):
-            commit_step(session, "S000")
+        if first_error == "caller":
+            blob = encode_frame(session, "S000")
+            words = {"blob": blob, "settings": {}, "actual": {}, "t_host_s": 0.0}
+            frames = [NewFrame(camera=name, **words) for name in ("C00", "C01", "C09")]
+            with pytest.raises(SessionError):  # of the camera C09, or of the file
+                session.commit_step("S000", frames)
+        else:
+            with pytest.raises(SessionDiskError, match=r"File exists|No space left"):
+                commit_step(session, "S000")
         assert stray.read_bytes() == b"of another program"
+        assert list((session.path / "frames").iterdir()) == [stray]
     with Session.resume(session.path) as again:
         commit_step(again, "S000")
         again.close()
-    orphans = {path.read_bytes() for path in (session.path / "orphans").iterdir()}
-    assert b"of another program" in orphans
+    orphans = [path.read_bytes() for path in (session.path / "orphans").iterdir()]
+    assert orphans == [b"of another program"]
     assert verify(session.path).ok
+
+
+@pytest.mark.parametrize("operation", ["rename", "fsync_dir", "fdatasync"])
+def test_stop_while_naming_releases_session(tmp_path, monkeypatch, operation):
+    """What reached the medium is unknown: a further step would hide that lines are missing."""
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    disk = Disk()
+    session = create_session(tmp_path / "s", plan=plan_of(2, len(CAMERAS)), rig=DOME, disk=disk)
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, operation, stop)
+        with pytest.raises(KeyboardInterrupt):
+            commit_step(session, "S000")
+    for call in (
+        lambda: commit_step(session, "S001"),
+        lambda: session.omit_steps(["S001"], reason="blinked", t_host_s=0.0),
+    ):
+        with pytest.raises(SessionError, match="not open for writing"):
+            call()
+    with Session.resume(session.path) as again:
+        for step in dict.fromkeys(step.id for step, _ in again.pending_frames()):
+            commit_step(again, step)
+        again.close()
+    assert verify(session.path).ok
+
+
+def test_stop_while_writing_line_releases_session(session, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session._disk, "fdatasync", stop)
+        with pytest.raises(KeyboardInterrupt):
+            session.omit_steps(["S000"], reason="blinked", t_host_s=0.0)
+    with pytest.raises(SessionError, match="not open for writing"):
+        commit_frame(session, "S001")
+
+
+def test_error_of_caller_is_not_the_disks(tmp_path):
+    """A camera's timeout is an error of the operating system's kind, too."""
+
+    def fail():
+        yield NewFrame(
+            camera="C00", blob=encode_frame(session, "S000"), settings={}, actual={}, t_host_s=0.0
+        )
+        raise TimeoutError("camera")
+
+    plan = plan_of(1, len(CAMERAS))
+    with create_session(tmp_path / "s", plan=plan, rig=DOME) as session:
+        with pytest.raises(TimeoutError, match="camera"):
+            session.commit_step("S000", fail())
+        assert list((session.path / "frames").iterdir()) == []
+        commit_step(session, "S000")
+        session.close()
+    assert verify(tmp_path / "s").ok
 
 
 def test_frames_are_written_while_next_ones_are_made(tmp_path):
