@@ -112,7 +112,7 @@ def expose(irradiance_rgb: Any, *, sensor: Any, **_: Any) -> Cost:
     """
     pixels = irradiance_rgb.shape[0] * irradiance_rgb.shape[1]
     gray = irradiance_rgb if irradiance_rgb.ndim == 2 else irradiance_rgb.mean(axis=2)
-    lit = np.count_nonzero(gray * sensor.gain_e_per_dn * (sensor.white - sensor.black) >= 10.0)
+    lit = int(np.count_nonzero(gray * sensor.gain_e_per_dn * (sensor.white - sensor.black) >= 10.0))
     return Cost(sum_bytes(irradiance_rgb) + 2 * pixels, normal=pixels, poisson=lit)
 
 
@@ -153,7 +153,7 @@ def light_plate(pixel, surface, lamps, axes, exponent, strength, out):  # type: 
 def trace_plate(rays, eye, turned, reflectance, waviness, subpixels, out):  # type: ignore[no-untyped-def]
     """Per corner: 15 operations, 3 divisions; per point on the plate and wave: 9, 3, a sine."""
     corners = rays.shape[0] * rays.shape[1]
-    waves = np.count_nonzero(out[..., 0]) * len(waviness)
+    waves = int(np.count_nonzero(out[..., 0])) * len(waviness)
     size = sum_bytes(rays, out)
     return Cost(size, float64=15 * corners + 9 * waves, division=3 * corners + 3 * waves, exp=waves)
 
@@ -163,7 +163,7 @@ def visible_fractions(uv, position, lights, radii, du, dv, horizon, highest, out
 
     Neighbors read neighboring texels, so that reads are not at random.
     """
-    points, pairs, near = len(uv), out.size, np.count_nonzero(out != 1.0)
+    points, pairs, near = len(uv), out.size, int(np.count_nonzero(out != 1.0))
     size = sum_bytes(uv, position) + out.nbytes
     flops, roots = 25 * points + 15 * pairs + 45 * near, points + 4 * pairs + 8 * near
     return Cost(size, float64=flops, division=roots, exp=3 * near)
@@ -220,7 +220,7 @@ def sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
 
     Two divisions of float32 run in the time of one of float64.
     """
-    higher = np.count_nonzero(out)
+    higher = int(np.count_nonzero(out))
     size = field.nbytes + out.nbytes
     return Cost(size, float32=5 * field.size + 2 * higher, division=0.5 * higher)
 
@@ -259,15 +259,15 @@ def half_vectors(values, light_dir, view_dir, view, valid, views, normals, stder
     return Cost(size, float64=2 * values.size + 9 * pairs, division=pairs, exp=pairs)
 
 
-def fit_envelope(
+def fit_envelope(  # type: ignore[no-untyped-def]
     f, variance, light, view, normal, valid, start, eta, tilt, has, r_d, stderr, counts, *_
-):  # type: ignore[no-untyped-def]
+):
     """Per sample: factors and 6 lobes once, then 8 steps of weights and normal equations.
 
     Picking 24 operations, factors 71 and 13 divisions and roots; a lobe 51 or 14 and 4. A step:
     32 and a division per channel; per lobe 2 per channel and 3; 21 products of two lobes.
     """
-    samples, channels = np.count_nonzero(valid.any(axis=2)), f.shape[2]
+    samples, channels = int(np.count_nonzero(valid.any(axis=2))), f.shape[2]
     step = 32 * channels + 6 * (2 * channels + 3) + 2 * 21
     flops = (24 + 71 + 4 * 51 + 2 * 14 + 8 * step) * samples
     size = sum_bytes(f, variance, light, view, valid)
@@ -279,7 +279,7 @@ def fit_basis(table, materials, kinship, value, variance, light, view, normal, v
 
     Row: 60 operations and 8 divisions or roots, 10 per column. A round: 2 per column, 3 for norms.
     """
-    samples, lanes = np.count_nonzero(valid), table.shape[3]
+    samples, lanes = int(np.count_nonzero(valid)), table.shape[3]
     flops = (10 + 2 * (1 + again) + 3 * again) * lanes * samples
     size = sum_bytes(value, variance, light, view, valid)
     return Cost(size, float32=flops, float64=60 * samples, division=8 * samples)
@@ -287,7 +287,7 @@ def fit_basis(table, materials, kinship, value, variance, light, view, normal, v
 
 def mix_basis(table, weights, light, view, normals, out):  # type: ignore[no-untyped-def]
     """Per sample: 114 operations and 9 divisions and roots for its nodes; 9 per basis BRDF."""
-    samples = np.count_nonzero(out)
+    samples = int(np.count_nonzero(out))
     flops = (114 + 9 * weights.shape[1]) * samples
     return Cost(sum_bytes(light, view, out), float64=flops, division=9 * samples)
 
