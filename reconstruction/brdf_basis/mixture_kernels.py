@@ -6,6 +6,7 @@
 import numpy as np
 from numba import float64, int64, njit, prange, uint64
 
+from model.checks import Checks
 from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.brdf_basis.row_kernels import FAST_MATH, NODES_D, NODES_H, NODES_PHI, find_nodes
 
@@ -34,10 +35,27 @@ def evaluate_mixtures(
     -------
     ndarray of float32, shape (P, M)
         f_r, 1/sr; 0 where light or view are below the horizon.
+
+    Raises
+    ------
+    ValueError
+        Arrays have other shapes: the loops read the table without a test of its limits.
     """
-    out = np.zeros(light_dir.shape[:2], np.float32)
+    points, samples = light_dir.shape[:2]
+    nodes = (NODES_D, NODES_PHI, NODES_H)
+    if table.ndim != 4 or table.shape[:3] != nodes or table.shape[3] < weights.shape[1]:
+        raise ValueError(
+            f"table: got shape {table.shape}, expected {nodes} and at least {weights.shape[1]} "
+            "BRDFs; use a basis of model.brdf.tables"
+        )
+    checks = Checks(ValueError)
+    checks.shape("weights", weights, (points, weights.shape[1]))
+    checks.shape("light_dir", light_dir, (points, samples, 3))
+    checks.shape("view_dir", view_dir, (points, samples, 3))
+    checks.shape("normals", normals, (points, 3))
+    out = np.zeros((points, samples), np.float32)
     _mixtures(
-        table,
+        np.ascontiguousarray(table, np.float32),
         np.ascontiguousarray(weights, np.float64),
         np.ascontiguousarray(light_dir, np.float32),
         np.ascontiguousarray(view_dir, np.float32),

@@ -23,6 +23,8 @@ MIN_FACTOR_COSINE = 0.05
 
 _N_LOBES = len(BECKMANN_ROUGHNESS) + len(GGX_ROUGHNESS)
 _N_BECKMANN = len(BECKMANN_ROUGHNESS)
+if _N_LOBES % 3:  # `_fill_lobe_equations` reads lobes in threes
+    raise ImportError(f"lobes: got {_N_LOBES}, expected a multiple of 3; add or remove a roughness")
 _ROUGHNESS_SQUARED = np.array(BECKMANN_ROUGHNESS + GGX_ROUGHNESS) ** 2
 
 

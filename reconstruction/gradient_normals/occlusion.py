@@ -109,7 +109,7 @@ def correct_occlusion(
     checks.within("height", relief)
     out, places = np.array(normals), np.zeros((*mask.shape, 2))
     places[mask] = disc_from_normal(np.asarray(normals[mask], np.float64))
-    samples = _horizon_samples(pixel_um)
+    samples = _horizon_samples(pixel_um, mask.shape)
     table = _light_table(lights, eta)
     found = _solve(np.pad(relief, samples[2], "edge"), places, samples, table, float(alpha))
     out[mask] = normal_from_disc(found[mask])
@@ -129,19 +129,25 @@ def _steps(pixel_um: float) -> Float64Array:
     return np.unique(np.round(HORIZON_STEP_RATIO ** np.arange(count + 1)))
 
 
-def _horizon_samples(pixel_um: float) -> tuple[Int64Array, Float64Array, int]:
-    """Return where each direction samples the relief about a pixel, and how far.
+def _horizon_samples(
+    pixel_um: float, size: tuple[int, ...]
+) -> tuple[Int64Array, Float64Array, int]:
+    """Return where each direction samples a relief of a size about a pixel, and how far.
 
     Rows and columns of the upper left neighbor, shape (2, K, S); fractions down and right of it,
-    and the inverse distance in 1/um, shape (3, K, S).
+    and the inverse distance in 1/um, shape (3, K, S). Beyond the relief its edge is repeated, so
+    that a sample as far away as the relief is wide has the height of any farther one.
     """
     steps = _steps(pixel_um)
     turn = 2.0 * math.pi * np.arange(HORIZON_DIRECTIONS) / HORIZON_DIRECTIONS
     place = np.stack([-np.outer(np.sin(turn), steps), np.outer(np.cos(turn), steps)])
+    side = np.array(size, np.float64)[:, None, None]
+    place = np.clip(place, -side, side)
     corner = np.floor(place)
     per_um = np.broadcast_to(1.0 / (steps * pixel_um), place.shape[1:])
     shift = np.ascontiguousarray(corner, np.int64)
-    return shift, np.concatenate([place - corner, per_um[None]]), int(steps.max()) + 1
+    margin = min(int(steps.max()), max(size)) + 1
+    return shift, np.concatenate([place - corner, per_um[None]]), margin
 
 
 def _light_table(lights: SphereLights, eta: float) -> tuple[Float64Array, Int64Array]:
@@ -226,7 +232,7 @@ def _raise_tangents(upper, lower, own, down, right, per_um, tangent):  # type: i
 
 @njit(fastmath=FINITE_MATH, error_model="numpy", forceinline=True)
 def _convert_to_elevations(tangent):  # type: ignore[no-untyped-def]
-    """Replace tangents >= 0 by elevations, within 1e-11 rad, in whole vectors."""
+    """Replace tangents >= 0 by elevations, within 4e-11 rad, in whole vectors."""
     for c in range(tangent.size):
         x = tangent[c]
         x = x / (1.0 + math.sqrt(1.0 + x * x))

@@ -82,7 +82,8 @@ def _pair_of_nodes(x, angles, reach):  # type: ignore[no-untyped-def]
 def _add_row_through(out, nx, ny, nz, tangent, right, up, share):  # type: ignore[no-untyped-def]
     for j in range(out.size):
         along, upward = nx[j] * right + ny[j] * up, np.float64(nz[j])
-        reach = math.sqrt(along * along + upward * upward)
+        # above 0, so that a normal across the sector, or one of length 0, adds 0 and not NaN
+        reach = max(math.sqrt(along * along + upward * upward), 1e-30)
         sin_low, cos_low = -along / reach, upward / reach
         t = np.float64(tangent[j])
         cos_high = 1.0 / math.sqrt(1.0 + t * t)
@@ -110,7 +111,8 @@ def _add_row_through(out, nx, ny, nz, tangent, right, up, share):  # type: ignor
 def add_sector_through(out, normals, tangent, angle, share):  # type: ignore[no-untyped-def]
     """Add one sector's hidden fraction with the transmittance of two boundaries.
 
-    ``normals`` (3, H, W) are planes: rows of single numbers are computed in whole vectors.
+    ``normals`` (3, H, W) are planes: rows of single numbers are computed in whole vectors. Their z
+    is at least 0: the sky below a wall that faces down is not between tangent plane and horizon.
     """
     right, up = math.cos(angle), math.sin(angle)
     for i in prange(out.shape[0]):

@@ -299,7 +299,7 @@ def hidden_sky_fraction(
     height_um
         Heights with ``margin`` more samples on all sides, um, shape (H + 2 m, W + 2 m).
     normals
-        Unit normals, shape (H, W, 3); +z is up.
+        Unit normals, shape (H, W, 3); +z is up, and z is at least 0.
     margin
         Number of those samples, >= 0.
     pixel_um
@@ -314,6 +314,11 @@ def hidden_sky_fraction(
     -------
     ndarray of float32
         Shape (H, W), 0 to 1.
+
+    Raises
+    ------
+    HorizonError
+        A normal points down, and for heights and numbers as `horizon_tangent`.
 
     Notes
     -----
@@ -336,6 +341,11 @@ def hidden_sky_fraction(
     """
     out = np.zeros(normals.shape[:2], np.float32)
     normals = np.ascontiguousarray(normals, np.float32)
+    down = normals[..., 2] < 0.0
+    if down.any():
+        raise HorizonError(
+            f"normals: got {np.count_nonzero(down)} with z < 0, expected >= 0; turn them upwards"
+        )
     planes = np.ascontiguousarray(np.moveaxis(normals, -1, 0)) if boundaries else normals
     inner = slice(margin, -margin or None)
     for k in range(sectors):

@@ -138,7 +138,8 @@ class CameraHits:
 def _average_hits(rows, pixel, first, out):  # type: ignore[no-untyped-def]
     for p in prange(pixel.shape[0]):
         mean = out[pixel[p]]
-        # the order of NumPy's `add.reduceat`, so that images keep their digits
+        # up to 8 hits in the order of NumPy's `add.reduceat`, so that images keep their digits;
+        # NumPy sums more of them in pairs, and the last digits differ
         for i in range(first[p] + 1, first[p + 1]):
             _add_row(rows[i], mean)
         _add_row(rows[first[p]], mean)

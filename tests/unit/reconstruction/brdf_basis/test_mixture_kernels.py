@@ -1,6 +1,7 @@
 """Compiled mixtures are those of the plain evaluation."""
 
 import numpy as np
+import pytest
 
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
@@ -42,3 +43,33 @@ def test_mirror_and_normal_directions_are_in_table(rng):
     assert np.isfinite(out).all()
     assert out[0, 0] > 0
     assert out[0, 2] == 0
+
+
+def test_table_in_any_layout_gives_equal_mixtures(rng):
+    table = rng.random((32, 12, 90, 16), np.float32)
+    light, view = directions(rng, 4, 5), directions(rng, 4, 5)
+    normals, weights = directions(rng, 4).astype(np.float64), rng.random((4, 4))
+    expected = mixture_kernels.evaluate_mixtures(table, weights, light, view, normals)
+    turned = np.asfortranarray(table)
+    found = mixture_kernels.evaluate_mixtures(turned, weights, light, view, normals)
+    np.testing.assert_array_equal(found, expected)
+    assert expected.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("table", (16, 12, 90, 16)),
+        ("table", (32, 12, 90, 3)),
+        ("weights", (3, 4)),
+        ("light_dir", (4, 5, 2)),
+        ("view_dir", (4, 4, 3)),
+        ("normals", (3, 3)),
+    ],
+)
+def test_arrays_of_other_shapes_are_refused(name, shape):
+    shapes = {"table": (32, 12, 90, 16), "weights": (4, 4), "light_dir": (4, 5, 3)}
+    shapes |= {"view_dir": (4, 5, 3), "normals": (4, 3)} | {name: shape}
+    arrays = {key: np.ones(one, np.float32) for key, one in shapes.items()}
+    with pytest.raises(ValueError, match=name):
+        mixture_kernels.evaluate_mixtures(**arrays)

@@ -15,6 +15,8 @@ from reconstruction.gradient_normals.occlusion import (
     HORIZON_STEP_RATIO,
     SOLVER_STEPS,
     SOLVER_TOLERANCE,
+    _convert_to_elevations,
+    _horizon_samples,
     correct_occlusion,
 )
 from reconstruction.gradient_normals.sphere_lights import (
@@ -42,7 +44,10 @@ def grooves(depth_um, side=96, period_px=24):
 
 
 def normals_of(relief):
-    down, right = np.gradient(relief, PIXEL_UM)
+    down, right = (
+        np.gradient(relief, PIXEL_UM, axis=axis) if relief.shape[axis] > 1 else 0.0 * relief
+        for axis in (0, 1)
+    )
     normals = np.stack([-right, down, np.ones_like(relief)], axis=-1)
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
@@ -54,26 +59,27 @@ def correct(relief, normals=None, valid=None, **settings):
     return correct_occlusion(normals, relief, valid, **(usual | settings))
 
 
-def plain_place(relief, row, column, lights, each):
+def plain_place(relief, row, column, lights, each, pixel_um=PIXEL_UM):
     """Return one pixel's place in plain Python: horizons by sampling, then all lights."""
     side_y, side_x = relief.shape
 
     def height(y, x):
         y, x = min(max(y, 0.0), side_y - 1.0), min(max(x, 0.0), side_x - 1.0)
-        i, j = min(int(y), side_y - 2), min(int(x), side_x - 2)
+        i, j = int(y), int(x)
+        below, right = min(i + 1, side_y - 1), min(j + 1, side_x - 1)
         v, u = y - i, x - j
-        upper = (1 - u) * relief[i, j] + u * relief[i, j + 1]
-        lower = (1 - u) * relief[i + 1, j] + u * relief[i + 1, j + 1]
+        upper = (1 - u) * relief[i, j] + u * relief[i, right]
+        lower = (1 - u) * relief[below, j] + u * relief[below, right]
         return (1 - v) * upper + v * lower
 
-    count = math.ceil(math.log(HORIZON_REACH_UM / PIXEL_UM, HORIZON_STEP_RATIO))
+    count = math.ceil(math.log(HORIZON_REACH_UM / pixel_um, HORIZON_STEP_RATIO))
     steps = sorted({round(HORIZON_STEP_RATIO**k) for k in range(count + 1)})
     horizon = np.zeros(HORIZON_DIRECTIONS)
     for k in range(HORIZON_DIRECTIONS):
         turn = 2 * math.pi * k / HORIZON_DIRECTIONS
         for step in steps:
             there = height(row - step * math.sin(turn), column + step * math.cos(turn))
-            tangent = (there - relief[row, column]) / (step * PIXEL_UM)
+            tangent = (there - relief[row, column]) / (step * pixel_um)
             horizon[k] = max(horizon[k], math.atan(tangent))
     ways = lights.directions
     elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1]))
@@ -88,6 +94,8 @@ def plain_place(relief, row, column, lights, each):
 
     first = disc_from_normal(normals_of(relief)[row, column])
     place = first
+    if not horizon.any():  # as on a plane, no light is hidden
+        return first
     for _ in range(SOLVER_STEPS):
         step = observed(first, 1.0) - observed(place, np.clip(free, 0.0, 1.0))
         place = place + step
@@ -106,6 +114,45 @@ def test_correction_equals_a_plain_sum_over_lights():
         expected = plain_place(relief, row, column, lights, each)
         assert found[row, column] == pytest.approx(expected, abs=1e-9), (row, column)
     assert np.abs(found - disc_from_normal(normals_of(relief))).max() > 0.01
+
+
+@pytest.mark.parametrize("width", [1, 5, 300, 513])
+def test_rows_of_any_width_equal_plain_sums(width):
+    """Rows are computed in blocks of 256 pixels: each block's ends, and a rest of one pixel."""
+    rng = np.random.default_rng(width)
+    relief = rng.standard_normal(width).cumsum() + 0.5 * rng.standard_normal((2, width))
+    found = disc_from_normal(correct(relief))
+    lights = even_sphere()
+    each = specular_sums(lights, view_frame((0.0, 0.0, 1.0)), ALPHA, ETA_SKIN)
+    columns = {0, width // 2, width - 1} | {c for c in (255, 256, 511) if c < width}
+    for row, column in [(row, column) for column in sorted(columns) for row in (0, 1)]:
+        expected = plain_place(relief, row, column, lights, each)
+        assert found[row, column] == pytest.approx(expected, abs=1e-9), (row, column)
+    smallest = 1e-5 if width == 1 else 1e-3  # two pixels hide little of each other
+    assert np.abs(found - disc_from_normal(normals_of(relief))).max() > smallest
+
+
+@pytest.mark.parametrize("pixel_um", [0.01, 1.0])
+def test_small_pixels_need_margin_of_relief(pixel_um):
+    """Beyond the relief its edge is repeated: a wider margin would have nothing new."""
+    rng = np.random.default_rng(8)
+    relief = 0.3 * pixel_um * rng.standard_normal((7, 12)).cumsum(axis=1)
+    assert _horizon_samples(pixel_um, relief.shape)[2] == 13
+    normals = normals_of(relief * PIXEL_UM / pixel_um)
+    found = disc_from_normal(correct(relief, normals, pixel_um=pixel_um))
+    lights = even_sphere()
+    each = specular_sums(lights, view_frame((0.0, 0.0, 1.0)), ALPHA, ETA_SKIN)
+    scaled = relief * PIXEL_UM / pixel_um  # `plain_place` takes the normals from this one
+    for row, column in ((0, 0), (3, 6), (6, 11)):
+        far = plain_place(scaled, row, column, lights, each, PIXEL_UM)
+        assert found[row, column] == pytest.approx(far, abs=1e-9), (row, column)
+
+
+def test_elevations_are_arc_tangents_up_to_vertical():
+    tangent = np.concatenate([[0.0], np.geomspace(1e-6, 1e15, 2000)])
+    found = tangent.copy()
+    _convert_to_elevations.py_func(found)
+    np.testing.assert_allclose(found, np.arctan(tangent), rtol=0.0, atol=4e-11)
 
 
 def test_flat_relief_hides_nothing():
