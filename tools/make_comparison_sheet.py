@@ -97,10 +97,7 @@ def flatten_image(image: Image.Image, path: Path) -> Image.Image:
     shown = image.convert("L" if image.mode in ("L", "LA", "1") else "RGB")
     if profile := image.info.get("icc_profile"):
         try:
-            own, srgb = (
-                ImageCms.ImageCmsProfile(io.BytesIO(profile)),
-                ImageCms.createProfile("sRGB"),
-            )
+            own, srgb = io.BytesIO(profile), ImageCms.createProfile("sRGB")
             shown = ImageCms.buildTransform(own, srgb, shown.mode, "RGB").apply(shown)
         except (OSError, ValueError, ImageCms.PyCMSError) as error:
             raise ComparisonError(f"{path}: ICC profile: {error}; convert it to sRGB") from error
@@ -155,9 +152,8 @@ def make_sheet(
     key: dict[str, Any] = {"A": str(a), "B": str(b), "trials": trials}
     key |= {"seed": seed, "consent": agreed}
     digest = hashlib.sha256(json.dumps(key).encode())
-    for side in faces.values():
-        for name in sorted(side):
-            digest.update(side[name].tobytes())
+    for image in (side[name] for side in faces.values() for name in sorted(side)):
+        digest.update(image.tobytes())
     key["sheet"] = digest.hexdigest()[:12]
     return _draw_page(key["sheet"], trials, faces), key
 

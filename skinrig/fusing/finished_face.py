@@ -169,9 +169,9 @@ def complete_skin(
     seed
         Seed of the person's parts that no rig measured.
     """
-    person: DisplayedPerson | ClosedMesh = close_holes(read_own_mesh(appearance))
-    if HEAD_FILE in appearance.files:
-        person = assemble_person(appearance, person, seed)
+    closed = close_holes(read_own_mesh(appearance))
+    has_head = HEAD_FILE in appearance.files
+    person = assemble_person(appearance, closed, seed) if has_head else closed
     atlas = unwrap(person.mesh, model.valid.shape[0])
     missing = atlas.covered & ~model.valid
     # false beyond it, at the rim of a scan: they face away from a camera in front of the skin
@@ -230,9 +230,12 @@ class _MovingColor:
         layers.append(fill_holes(change, known))
         texels = whole.model.valid
         painted = whole.person.paint(np.stack(layers, axis=-1))[texels].astype(np.float64)
+        melanin_there, blood_there, change_there = np.moveaxis(painted, -1, 0)
         return _MovingColor(
             dataclasses.replace(whole.model, r_d=shown.astype(np.float32)),
-            *(painted[:, k] for k in range(len(layers))),
+            melanin_there,
+            blood_there,
+            change_there,
             texels,
             float((known & good).sum() / max(good.sum(), 1)),
             color_table.build(spectra.LINEAR_SRGB, "D65", size=24, anisotropy=ANISOTROPY_SKIN),
