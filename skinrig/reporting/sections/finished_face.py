@@ -27,7 +27,7 @@ DOCUMENT_TYPES: dict[str, type | tuple[type, ...]] = {
     "inputs": dict,
 }
 """Types of the entries of the record that the section shows."""
-ADVICE = "remove the folder, or render the face again with `skinrig demo`"
+RENDER_ADVICE = "remove the folder, or render the face again with `skinrig demo`"
 
 
 def section(folder: Path, number: int, report_folder: Path | None) -> Iterator[page.Block]:
@@ -52,7 +52,7 @@ def section(folder: Path, number: int, report_folder: Path | None) -> Iterator[p
     try:
         image = sheet.read_bytes()
     except OSError as error:
-        raise ReportError(f"{sheet}: {error.strerror}; {ADVICE}") from error
+        raise ReportError(f"{sheet}: {error.strerror}; {RENDER_ADVICE}") from error
     live = folder.parent / LIVE_PAGE
     person = folder.parent / document["person"]
     width, height = frame_sheet.FRAME_PX
@@ -75,17 +75,24 @@ def section(folder: Path, number: int, report_folder: Path | None) -> Iterator[p
 def _read(path: Path) -> dict[str, Any]:
     """Read and check the record of a finished face."""
     document = read_json(path)
+    if wrong := _find_fault(document):
+        raise ReportError(f"{path}: {wrong}; {RENDER_ADVICE}")
+    return document
+
+
+def _find_fault(document: dict[str, Any]) -> str:
+    """Return what is wrong with a record, in words; empty if nothing is."""
     if document["schema"] != SCHEMA:
-        raise ReportError(f"{path}: got schema {document['schema']!r}, expected {SCHEMA}; {ADVICE}")
+        return f"got schema {document['schema']!r}, expected {SCHEMA}"
     for key, kind in DOCUMENT_TYPES.items():
         if not isinstance(document.get(key), kind):
-            raise ReportError(f"{path}: got no valid {key!r}, expected that of {SCHEMA}; {ADVICE}")
+            return f"got no valid {key!r}, expected that of {SCHEMA}"
     for key, count in (("lights", frame_sheet.N_LIGHTS), ("weights", frame_sheet.N_STEPS)):
         if len(document[key]) != count:
-            raise ReportError(f"{path}: got {len(document[key])} {key}, expected {count}; {ADVICE}")
+            return f"got {len(document[key])} {key}, expected {count}"
     if not all(isinstance(row, list) and len(row) == 2 for row in document["left_out"]):
-        raise ReportError(f"{path}: got no pairs in 'left_out', expected part and reason; {ADVICE}")
-    return document
+        return "got no pairs in 'left_out', expected part and reason"
+    return ""
 
 
 def _list_changed(parent: Path, inputs: dict[str, str]) -> list[str]:

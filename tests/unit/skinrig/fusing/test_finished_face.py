@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fixtures.finished_faces import HEAD_BLOOD, HEAD_MELANIN, HEAD_PX, matte_head
+from fixtures.head_scans import draw_scan
 
 from model import color_table, spectra, store
 from model.facial_color import HemoglobinRig
@@ -14,6 +15,7 @@ from model.facial_color.document import RIG_DOCUMENT, to_maps
 from model.skin import SkinAppearance
 from model.skin_reflectance import assemble
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from rigsim.geometry.atlas import unwrap
 from skinrig.appearances.contents import hash_document
 from skinrig.fusing import finished_face
 from skinrig.fusing.finished_face import (
@@ -24,8 +26,11 @@ from skinrig.fusing.finished_face import (
 )
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SHEET_FILE
 from skinrig.fusing.sources import FusionInputError
+from skinrig.unmeasured.head_fit import fit_head
+from skinrig.unmeasured.person import HEAD_FILE
 
 FRAME_PX = (48, 54)
+R_D = (0.4, 0.3, 0.2)
 BACKGROUND = (40, 42, 45)
 
 
@@ -196,3 +201,22 @@ def test_unmeasured_texels_have_normals_of_the_mesh(head):
             np.testing.assert_allclose(found.r_d[hole], model.r_d[hole], rtol=1e-5)
         kept = valid & covered
         np.testing.assert_array_equal(found.normals[kept], model.normals[kept])
+
+
+@pytest.mark.long
+def test_crown_and_neck_continue_the_scan():
+    scan, _ = draw_scan(300)
+    appearance, _ = matte_head(scan)
+    files = {**appearance.files, HEAD_FILE: fit_head(scan).to_bytes()}
+    model = assemble(appearance)
+    whole = complete_skin(dataclasses.replace(appearance, files=files), model, seed=0)
+    height = whole.person.mesh.vertices_mm[:, 1]
+    assert height.max() > scan.vertices_mm[:, 1].max() + 5.0
+    assert height.min() < scan.vertices_mm[:, 1].min() - 5.0
+    everywhere = unwrap(whole.person.mesh, HEAD_PX).covered
+    assert whole.model.valid[everywhere].all()
+    assert (everywhere & ~model.valid).sum() > 50
+    np.testing.assert_allclose(
+        whole.model.r_d[everywhere], np.broadcast_to(R_D, (everywhere.sum(), 3)), rtol=1e-3
+    )
+    assert "crown, neck and sides of the head" in dict(whole.person.summary())
