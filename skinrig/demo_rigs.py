@@ -337,14 +337,16 @@ def fuse_person(run: RigDemo, rigs: Sequence[str], errors: Sequence[list[Any]] =
     named = double.contradiction or "none"
     run.found.add_table("Rig that contradicts the others", ["rig"], [[named]])
     with run.share("light and move the finished face"):
-        moving = store.read(run.out / FLASH_MOVING_FOLDER)
+        maps = run.out / DOUBLE_FOLDER, run.out / FLASH_MOVING_FOLDER
+        moving = store.read(maps[1])
         face = render_finished_face(double, moving, expression=FLASH_STATES[1], seed=run.seed)
         write_finished_face(
             run.out / FACE_FOLDER,
             face,
             double,
+            moving,
             errors=_list_errors_shown([*errors, *run.found.errors]),
-            person=DOUBLE_FOLDER,
+            folders=maps,
         )
 
 

@@ -4,7 +4,8 @@
     python tools/make_comparison_sheet.py evaluate key.json answers.csv ...
 
 A and B are folders of images with equal names, such as ``III-left.png``, or of fitted maps. Maps
-are rendered under three lights in their camera's RGB. The key has the sides: observers lack it.
+are rendered under three lights in their camera's RGB; holes, crown and neck are completed. The key
+has sides and consent: observers lack it. Maps of measured people need ``--use``.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import hashlib
+import io
 import json
 import sys
 from collections import Counter
@@ -22,15 +24,15 @@ from typing import Any
 import numpy as np
 from markupsafe import escape
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from scipy.stats import binomtest
 
 from model import store
+from skinrig.consent import format_consent, merge_consent, require_consent
 from skinrig.drawing import png, templates
-from skinrig.fusing.finished_face import aim_camera, build_lights
+from skinrig.fusing.finished_face import BACKGROUND_CODES, aim_camera, build_lights, complete_skin
 from skinrig.rendering.folder import apply_tone_curve, choose_exposure
-from skinrig.rendering.geometry import FittedSurface, read_own_mesh
-from skinrig.rendering.hole_patches import close_holes
+from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.render import render_light_groups
 from skinrig.rendering.request import read_model
 
@@ -38,10 +40,13 @@ THREE_LIGHTS_DEG = {"left": -60.0, "front": 0.0, "right": 60.0}
 IMAGE_PX = (400, 450)
 """Width and height of the images of a sheet; others are cut to it around their middle."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+IMAGE_MODES = ("RGB", "RGBA", "L", "LA", "P", "PA", "1")
+"""Modes of Pillow that are converted; others have more bits, or inks."""
 JPEG_QUALITY = 92
 QUESTION = "Which face looks more like a photograph of a person?"
 CONFIDENCE = 0.95
 ANSWER_COLUMNS = ("sheet", "observer", "trial", "answer")
+Faces = dict[str, NDArray[np.uint8]]
 PAGE_STYLE = """:root{color-scheme:light dark}
 body{font:16px/1.5 system-ui,sans-serif;max-width:54rem;margin:0 auto;padding:1rem}
 fieldset{margin:2rem 0;border:1px solid #888}
@@ -67,30 +72,53 @@ class ComparisonError(ValueError):
     """Folders or answers that cannot be compared."""
 
 
-def read_faces(folder: Path) -> dict[str, NDArray[np.uint8]]:
-    """Return the images of a folder, (H, W, 3), by name; fitted maps are rendered."""
+def read_faces(folder: Path, use: str | None = None) -> tuple[Faces, list[str]]:
+    """Return the images of a folder, or of its rendered maps, and the consent of their subjects."""
     if (folder / store.DOCUMENT_FILE).is_file():
-        return render_faces(folder)
-    found = {}
+        return render_faces(folder, use)
+    found: Faces = {}
     for path in sorted(folder.iterdir() if folder.is_dir() else ()):
         if path.suffix.lower() in IMAGE_SUFFIXES:
+            if path.stem in found:
+                raise ComparisonError(f"{path}: got two images named {path.stem}; rename one")
             with Image.open(path) as image:
-                turned = ImageOps.exif_transpose(image).convert("RGB")
+                turned = flatten_image(ImageOps.exif_transpose(image), path)
             fitted = ImageOps.fit(turned, IMAGE_PX, Image.Resampling.LANCZOS)
             found[path.stem] = np.asarray(fitted, np.uint8)
-    return found
+    return found, ["unknown: images have no consent record"]
 
 
-def render_faces(folder: Path) -> dict[str, NDArray[np.uint8]]:
-    """Return fitted maps under three lights, at one exposure, by light; holes are closed."""
+def flatten_image(image: Image.Image, path: Path) -> Image.Image:
+    """Return an image as sRGB on the background of rendered faces; raise for other modes."""
+    if image.mode not in IMAGE_MODES:
+        raise ComparisonError(
+            f"{path}: got mode {image.mode}, expected 8 bits per channel, gray or RGB; convert it"
+        )
+    shown = image.convert("L" if image.mode in ("L", "LA", "1") else "RGB")
+    if profile := image.info.get("icc_profile"):
+        try:
+            own, srgb = io.BytesIO(profile), ImageCms.createProfile("sRGB")
+            shown = ImageCms.buildTransform(own, srgb, shown.mode, "RGB").apply(shown)
+        except (OSError, ValueError, ImageCms.PyCMSError) as error:
+            raise ComparisonError(f"{path}: ICC profile: {error}; convert it to sRGB") from error
+    flat = Image.new("RGB", image.size, tuple(int(code) for code in BACKGROUND_CODES))
+    flat.paste(shown.convert("RGB"), mask=image.convert("RGBA").getchannel("A"))
+    return flat
+
+
+def render_faces(folder: Path, use: str | None) -> tuple[Faces, list[str]]:
+    """Return fitted maps under three lights, at one exposure, by light, and their consent."""
     appearance, model = read_model(folder)
-    surface = FittedSurface.of(model, close_holes(read_own_mesh(appearance)).mesh)
-    groups = [[light] for light in build_lights(THREE_LIGHTS_DEG)]
-    found = render_light_groups(surface, aim_camera(IMAGE_PX), groups)
+    require_consent(appearance, use, folder=str(folder))
+    whole = complete_skin(appearance, model, seed=0)
+    surface = FittedSurface.of(whole.model, whole.person.mesh)
+    lights = [[light] for light in build_lights(THREE_LIGHTS_DEG)]
+    found = render_light_groups(surface, aim_camera(IMAGE_PX), lights)
     front = found[list(THREE_LIGHTS_DEG).index("front")]
     exposure = choose_exposure(front.radiance, front.coverage)
     shown = [apply_tone_curve(one.radiance, exposure) for one in found]
-    return dict(zip(THREE_LIGHTS_DEG, shown, strict=True))
+    consent = format_consent(merge_consent(appearance))
+    return dict(zip(THREE_LIGHTS_DEG, shown, strict=True)), consent
 
 
 def arrange_trials(names: Sequence[str], repeats: int, seed: int) -> list[dict[str, Any]]:
@@ -106,30 +134,31 @@ def arrange_trials(names: Sequence[str], repeats: int, seed: int) -> list[dict[s
     return [{"trial": n, **trials[k]} for n, k in enumerate(rng.permutation(len(trials)), 1)]
 
 
-def make_sheet(a: Path, b: Path, *, seed: int, repeats: int = 2) -> tuple[str, dict[str, Any]]:
+def make_sheet(
+    a: Path, b: Path, *, seed: int, repeats: int = 2, use: str | None = None
+) -> tuple[str, dict[str, Any]]:
     """Return the page and the key; raise if the folders have no image, or different names."""
-    faces = {"A": read_faces(a), "B": read_faces(b)}
-    if not faces["A"] or faces["A"].keys() != faces["B"].keys():
-        raise ComparisonError(
-            f"{a}, {b}: got images {', '.join(faces['A']) or 'none'} and "
-            f"{', '.join(faces['B']) or 'none'}, expected equal names; rename them"
-        )
-    if repeats < 1:
-        raise ComparisonError(f"--repeats: got {repeats}, expected 1 or more; enter another")
+    for name, value, least in (("--repeats", repeats, 1), ("--seed", seed, 0)):
+        if value < least:
+            raise ComparisonError(f"{name}: got {value}, expected {least} or more; enter another")
+    faces, agreed = {}, {}
+    for side, folder in (("A", a), ("B", b)):
+        faces[side], agreed[side] = read_faces(folder, use)
+    names, others = (", ".join(faces[side]) or "none" for side in "AB")
+    if not faces["A"] or names != others:
+        got = f"{a}, {b}: got images {names} and {others}"
+        raise ComparisonError(f"{got}, expected equal names; rename them")
     trials = arrange_trials(sorted(faces["A"]), repeats, seed)
-    key: dict[str, Any] = {"A": str(a), "B": str(b), "seed": seed, "trials": trials}
-    # the identity contains the images, so that answers to another sheet are found
+    key: dict[str, Any] = {"A": str(a), "B": str(b), "trials": trials}
+    key |= {"seed": seed, "consent": agreed}
     digest = hashlib.sha256(json.dumps(key).encode())
-    for side in faces.values():
-        for name in sorted(side):
-            digest.update(side[name].tobytes())
+    for image in (side[name] for side in faces.values() for name in sorted(side)):
+        digest.update(image.tobytes())
     key["sheet"] = digest.hexdigest()[:12]
     return _draw_page(key["sheet"], trials, faces), key
 
 
-def _draw_page(
-    sheet: str, trials: Sequence[dict[str, Any]], faces: dict[str, dict[str, NDArray[np.uint8]]]
-) -> str:
+def _draw_page(sheet: str, trials: Sequence[dict[str, Any]], faces: dict[str, Faces]) -> str:
     parts = []
     for one in trials:
         number, sides = one["trial"], (one["left"], "B" if one["left"] == "A" else "A")
@@ -137,9 +166,8 @@ def _draw_page(
         for place, side in zip(("left", "right"), sides, strict=True):
             address = png.encode_jpeg_url(faces[side][one["pair"]], quality=JPEG_QUALITY)
             cells.append(
-                f'<label><img alt="{place} face of trial {number}" src="{address}"><br>'
-                f'<input type="radio" name="trial-{number}" value="{place}" required> {place}'
-                "</label>"
+                f'<label><img alt="{place} face of trial {number}" src="{address}"><br><input '
+                f'type="radio" name="trial-{number}" value="{place}" required> {place}</label>'
             )
         legend = f"<legend>Trial {number} of {len(trials)}</legend>"
         parts.append(f'<fieldset>{legend}<div class="pair">{"".join(cells)}</div></fieldset>')
@@ -154,8 +182,7 @@ def _draw_page(
 <p>Choose one face per pair, also when you are not sure. Then save the answers.</p>
 <form data-sheet="{sheet}">
 <p><label>Your code: <input name="observer" required maxlength="20"></label></p>
-{"".join(parts)}
-<p><button>Save the answers</button></p></form></main>
+{"".join(parts)}<p><button>Save the answers</button></p></form></main>
 <script>{PAGE_SCRIPT}</script></body></html>
 """
 
@@ -165,56 +192,75 @@ def read_answers(path: Path, sheet: str) -> list[dict[str, str]]:
     with path.open(encoding="utf-8-sig", newline="") as text:
         table = csv.DictReader(text)
         if tuple(table.fieldnames or ()) != ANSWER_COLUMNS:
-            raise ComparisonError(
-                f"{path}: got columns {table.fieldnames}, expected {', '.join(ANSWER_COLUMNS)}"
-            )
+            expected = ", ".join(ANSWER_COLUMNS)
+            raise ComparisonError(f"{path}: got columns {table.fieldnames}, expected {expected}")
         rows = list(table)
     if foreign := {row["sheet"] for row in rows} - {sheet}:
         raise ComparisonError(f"{path}: got answers to sheet {foreign.pop()}, expected {sheet}")
     return rows
 
 
-def evaluate(key: dict[str, Any], answers: Sequence[dict[str, str]]) -> dict[str, Any]:
-    """Return how often A was chosen, with its exact binomial interval (Clopper-Pearson).
+def read_key(path: Path) -> dict[str, Any]:
+    """Read the key of a sheet; raise if it is another file."""
+    try:
+        key = json.loads(path.read_text(encoding="utf-8"))
+        sides = {one["left"] for one in key["trials"] if (one["trial"], one["pair"])}
+        if not isinstance(key["sheet"], str) or not sides or not sides <= {"A", "B"}:
+            raise ValueError(f"sheet {key['sheet']!r} with sides {sorted(sides)}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ComparisonError(f"{path}: not a sheet's key ({error!r}); give another") from error
+    return dict(key)
 
-    The interval counts answers as independent; those of one observer, or to one pair, are not:
-    both have counts of their own. An invalid, unknown or repeated answer raises.
+
+def evaluate(key: dict[str, Any], answers: Sequence[dict[str, str]]) -> dict[str, Any]:
+    """Return how often A was chosen, and a sign test over observers.
+
+    An observer prefers the side that it chose more often. Observers are independent; answers of one
+    observer are not, so that they have no interval. An invalid, unknown or repeated answer raises.
     """
     trials = {str(one["trial"]): one for one in key["trials"]}
     for row in answers:
         if row["trial"] not in trials or row["answer"] not in ("left", "right"):
-            raise ComparisonError(
-                f"answers: got {row['answer']!r} for trial {row['trial']!r}, expected left or "
-                f"right for 1 to {len(trials)}"
-            )
+            what = f"got {row['answer']!r} for trial {row['trial']!r}"
+            raise ComparisonError(f"answers: {what}, expected left or right for 1 to {len(trials)}")
     twice = [k for k, n in Counter((r["observer"], r["trial"]) for r in answers).items() if n > 1]
     if twice or not answers:
         what = f"two answers of {twice[0][0]!r} to trial {twice[0][1]}" if twice else "none"
         raise ComparisonError(f"answers: got {what}, expected one per observer and trial")
-    chose_a = [
-        (row["answer"] == "left") == (trials[row["trial"]]["left"] == "A") for row in answers
-    ]
-    found = _count(chose_a)
-    for kind, groups in (
-        ("observers", [row["observer"] for row in answers]),
-        ("pairs", [trials[row["trial"]]["pair"] for row in answers]),
-    ):
-        found[kind] = {
-            one: _count([a for a, group in zip(chose_a, groups, strict=True) if group == one])
-            for one in sorted(set(groups))
-        }
-    return found
 
+    def count_groups(groups: Sequence[str]) -> dict[str, dict[str, Any]]:
+        rows = list(zip(groups, answers, strict=True))
+        return {k: _count([row for n, row in rows if n == k], trials) for k in sorted(set(groups))}
 
-def _count(chose_a: Sequence[bool]) -> dict[str, Any]:
-    test = binomtest(sum(chose_a), len(chose_a))
-    low, high = test.proportion_ci(CONFIDENCE, method="exact")
-    found = {
-        "answers": len(chose_a),
-        "chose_a": sum(chose_a),
-        "fraction": sum(chose_a) / len(chose_a),
+    observers = count_groups([row["observer"] for row in answers])
+    for one in observers.values():
+        one["missing_trials"] = len(trials) - one["answers"]
+    return {
+        **_count(answers, trials),
+        "missing_trials": len(trials) * len(observers) - len(answers),
+        "sign_test": _test_signs([one["fraction"] for one in observers.values()]),
+        "observers": observers,
+        "pairs": count_groups([trials[row["trial"]]["pair"] for row in answers]),
     }
-    return {**found, "interval_95": [float(low), float(high)], "p_value": float(test.pvalue)}
+
+
+def _count(rows: Sequence[dict[str, str]], trials: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the number of answers, of those for A, and the fractions for A and for the left."""
+    left = sum(row["answer"] == "left" for row in rows)
+    a = sum((r["answer"] == "left") == (trials[r["trial"]]["left"] == "A") for r in rows)
+    n = len(rows)
+    return {"answers": n, "chose_a": a, "fraction": a / n, "fraction_left": left / n}
+
+
+def _test_signs(fractions: Sequence[float]) -> dict[str, Any]:
+    """Return the sign test over observers, and the exact interval of those who prefer A."""
+    for_a, for_b = (sum(sign * (f - 0.5) > 0 for f in fractions) for sign in (1, -1))
+    signs = {"prefer_a": for_a, "prefer_b": for_b, "ties": len(fractions) - for_a - for_b}
+    if for_a + for_b == 0:
+        return {**signs, "interval_95": None, "p_value": None}
+    test = binomtest(for_a, for_a + for_b)
+    interval = test.proportion_ci(CONFIDENCE, method="exact")
+    return {**signs, "interval_95": [float(x) for x in interval], "p_value": float(test.pvalue)}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -227,22 +273,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sheet.add_argument("--key", type=Path, default=Path("key.json"))
     sheet.add_argument("--seed", type=int, required=True)
     sheet.add_argument("--repeats", type=int, default=2)
+    sheet.add_argument("--use", help="purpose of the sheet, which measured people agreed to")
     judged = parts.add_parser("evaluate")
     judged.add_argument("key", type=Path)
     judged.add_argument("answers", type=Path, nargs="+")
     given = parser.parse_args(arguments)
     try:
         if given.part == "sheet":
-            page, key = make_sheet(*given.folders, seed=given.seed, repeats=given.repeats)
+            options = {name: getattr(given, name) for name in ("seed", "repeats", "use")}
+            page, key = make_sheet(*given.folders, **options)
             given.out.write_text(page, encoding="utf-8")
             given.key.write_text(json.dumps(key, indent=1) + "\n", encoding="utf-8")
         else:
-            key = json.loads(given.key.read_text(encoding="utf-8"))
+            key = read_key(given.key)
             rows = [row for path in given.answers for row in read_answers(path, key["sheet"])]
             print(json.dumps(evaluate(key, rows), indent=1))
-    except ComparisonError as error:
+    except (ValueError, OSError, csv.Error) as error:
         print(error, file=sys.stderr)
-        return 1
+        return 2
     return 0
 
 

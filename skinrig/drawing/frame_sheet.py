@@ -61,7 +61,8 @@ def build_style() -> str:
     """Return the style of sheets: rows by the chosen radio button, columns by an animation.
 
     The animation runs where the user's system does not ask for reduced motion. The check box
-    stops it there, and starts it elsewhere.
+    stops it there, and starts it elsewhere. A browser without `:has` gets row `FIRST_LIGHT` at
+    rest, without buttons: they would have no effect.
     """
     width, height = FRAME_PX
     end = 100.0 * (N_STEPS - 1) / N_STEPS
@@ -76,7 +77,11 @@ def build_style() -> str:
         [
             f".player .frame{{overflow:hidden;aspect-ratio:{width}/{height}}}",
             f".player .frame img{{width:{100 * N_STEPS}%;max-width:none;border:0;"
-            f"animation:express {PERIOD_S:g}s {steps} infinite alternate}}",
+            f"translate:0 -{100.0 * FIRST_LIGHT / N_LIGHTS:g}%}}",
+            ".player fieldset,.player .play{display:none}",
+            "@supports selector(:has(*)){",
+            ".player fieldset{display:grid}.player .play{display:flex}",
+            f".player .frame img{{animation:express {PERIOD_S:g}s {steps} infinite alternate}}",
             f"@keyframes express{{0%,{PAUSE_PERCENT}%{{transform:none}}"
             f"{100 - PAUSE_PERCENT}%,100%{{transform:translateX(-{end:g}%)}}}}",
             f".player:has(.toggle:checked) .frame img{{{stop}}}",
@@ -86,5 +91,6 @@ def build_style() -> str:
             f".player:has(.toggle:checked) .frame img{{{play}}}"
             ".player .moves{display:none}.player .rests{display:inline}}",
             *rows,
+            "}",
         ]
     )

@@ -1,7 +1,7 @@
 """Render a fused person's face under several lights, from rest to an expression.
 
 Color, normals, reflection and blood are measured. The movement of the mesh is the simulator's:
-no rig measures it in the demo.
+no rig measures it in the demo. Crown and neck are those of the fitted mean head.
 """
 
 import dataclasses
@@ -18,9 +18,11 @@ from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance, assemble
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX
+from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.subject import expressions
 from skinrig import consent
+from skinrig.appearances.contents import hash_document
 from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt8Array
 from skinrig.atomic_file import replace_folder_atomically
@@ -34,9 +36,10 @@ from skinrig.fusing.sources import FusionInputError
 from skinrig.rendering.camera import Camera, look_at
 from skinrig.rendering.folder import apply_tone_curve, choose_exposure
 from skinrig.rendering.geometry import FittedSurface, read_own_mesh
-from skinrig.rendering.hole_patches import close_holes
+from skinrig.rendering.hole_patches import ClosedMesh, close_holes
 from skinrig.rendering.lights import Light
 from skinrig.rendering.render import Rendering, render_light_groups
+from skinrig.unmeasured.person import HEAD_FILE, DisplayedPerson, assemble_person
 from skinrig.viewer.map_filling import fill_holes
 
 LIGHT_AZIMUTHS_DEG: Final = {
@@ -54,9 +57,13 @@ SHADOW_SAMPLES: Final = 2
 FILL_WEIGHT: Final = 0.3
 """Weight of the mean over all lights, which fills the shadows."""
 CAMERA_MM: Final = (0.0, 0.0, 700.0)
-TARGET_MM: Final = (0.0, 8.0, 0.0)
-FIELD_OF_VIEW_DEG: Final = 15.6
-"""Of the longer side: 192 mm at the origin of the rig, from the crown to the neck."""
+TARGET_MM: Final = (0.0, 15.0, 0.0)
+FIELD_OF_VIEW_DEG: Final = 17.8
+"""Of the longer side: 219 mm at the origin of the rig, from the crown to the neck."""
+MIN_NORMAL_COSINE: Final = 0.5
+"""Least cosine between a drawn measured normal and that of the mesh."""
+UNDRAWN_PARTS: Final = "eyes, lids, lashes, brows and hair"
+"""Parts of `DisplayedPerson.summary` that the frames lack."""
 BACKGROUND_CODES: Final = np.array([40.0, 42.0, 45.0])
 """8-bit sRGB."""
 
@@ -75,6 +82,8 @@ class FinishedFace:
         Weight of the expression at each step.
     blood_fraction
         Fraction of the texels with a measured change of blood; the rest has it from around.
+    seed
+        Seed of the movement and of the parts that no rig measured.
     left_out
         Omissions with reasons.
     """
@@ -83,6 +92,7 @@ class FinishedFace:
     expression: str
     weights: tuple[float, ...]
     blood_fraction: float
+    seed: int
     left_out: tuple[tuple[str, str], ...]
 
 
@@ -107,24 +117,78 @@ def render_finished_face(
     FusionInputError
         If the person lacks a dome or a flash rig, or the expression is unknown.
     """
-    model = assemble(double.appearance)
-    closed = close_holes(read_own_mesh(double.appearance))
-    shapes = expressions.blend_shapes(closed.mesh, seed=seed)
-    require_choice("expression", expression, tuple(shapes), FusionInputError)
-    skin = _MovingColor.of(double, model, moving, expression)
+    require_choice(
+        "expression", expression, tuple(expressions.EXPRESSION_STRENGTHS), FusionInputError
+    )
+    whole = complete_skin(double.appearance, assemble(double.appearance), seed=seed)
+    mesh = whole.person.mesh
+    moved_mm = expressions.displacement_mm(mesh, expression, seed=seed)
+    skin = _MovingColor.of(double, whole, moving, expression)
     weights = np.linspace(0.0, 1.0, N_STEPS)
-    steps = [
-        _render_step(skin.at(float(w)), closed.mesh, np.float32(w) * shapes[expression])
-        for w in weights
-    ]
+    steps = [_render_step(skin.at(float(w)), mesh, np.float32(w) * moved_mm) for w in weights]
     left_out = (
-        *closed.summary(),
+        *(row for row in whole.person.summary() if row[0] != UNDRAWN_PARTS),
         ("movement of this face", "no rig measures it here; the blend shapes are simulated"),
-        ("eyes, hair and fine wrinkles", "the fused maps have none"),
+        ("fine wrinkles", "the fused maps have none"),
+        ("open eyes and hair", "not drawn here, as no rig measures them"),
     )
     return FinishedFace(
-        _develop(steps), expression, tuple(weights.tolist()), skin.known_fraction, left_out
+        _develop(steps), expression, tuple(weights.tolist()), skin.known_fraction, seed, left_out
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompletedSkin:
+    """A person's mesh without holes, and the reflectance on it.
+
+    Attributes
+    ----------
+    person
+        Mesh with closed holes, and with crown and neck if the mean head is fitted to it.
+    model
+        Fitted model, valid on the whole mesh. Texels without a measurement have values of their
+        surroundings, and normals of the mesh: means of steep normals can face away from the
+        camera, which renders black.
+    """
+
+    person: DisplayedPerson | ClosedMesh
+    model: SkinReflectance
+
+
+def complete_skin(
+    appearance: SkinAppearance, model: SkinReflectance, *, seed: int
+) -> CompletedSkin:
+    """Close the holes of a person's mesh, complete its crown and neck, and continue the maps there.
+
+    Parameters
+    ----------
+    appearance
+        Maps with their mesh; the fitted mean head is used where it is among the files.
+    model
+        Model of these maps.
+    seed
+        Seed of the person's parts that no rig measured.
+    """
+    closed = close_holes(read_own_mesh(appearance))
+    has_head = HEAD_FILE in appearance.files
+    person = assemble_person(appearance, closed, seed) if has_head else closed
+    atlas = unwrap(person.mesh, model.valid.shape[0])
+    missing = atlas.covered & ~model.valid
+    # false beyond it, at the rim of a scan: they face away from a camera in front of the skin
+    turned = np.einsum("hwk,hwk->hw", atlas.normal, model.normals) < MIN_NORMAL_COSINE
+    smooth = (missing | (atlas.covered & turned))[..., None]
+    count = model.r_d.shape[-1]
+    values = np.concatenate([model.r_d, model.weights], axis=-1)
+    painted = person.paint(fill_holes(values, model.valid))
+    whole = dataclasses.replace(
+        model,
+        r_d=painted[..., :count],
+        weights=np.maximum(painted[..., count:], 0.0),
+        normals=np.where(smooth, atlas.normal, model.normals).astype(np.float32),
+        position_mm=np.where(missing[..., None], atlas.position_mm, model.position_mm),
+        valid=model.valid | atlas.covered,
+    )
+    return CompletedSkin(person, whole)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,13 +204,13 @@ class _MovingColor:
     change: Float64Array
     """Its measured change to the full expression, shape (n,)."""
     texels: BoolArray
-    """(H, W): texels with chromophores."""
+    """(H, W): texels of the mesh."""
     known_fraction: float
     table: color_table.ColorTable
 
     @staticmethod
     def of(
-        double: FusedDouble, model: SkinReflectance, moving: SkinAppearance, expression: str
+        double: FusedDouble, whole: CompletedSkin, moving: SkinAppearance, expression: str
     ) -> "_MovingColor":
         """Place the measured change of blood on the texels of the fused maps."""
         placement, maps = double.measured.placement, double.appearance.maps
@@ -161,13 +225,18 @@ class _MovingColor:
         melanin, blood = maps["melanin"], maps["hemoglobin"]
         good = melanin.mask & blood.mask
         rgb, _ = fit_skin_colors(bands.camera, bands.illuminant)
-        shown = np.clip(np.asarray(model.r_d, np.float64) @ rgb, 0.0, 1.0)
+        shown = np.clip(np.asarray(whole.model.r_d, np.float64) @ rgb, 0.0, 1.0)
+        layers = [fill_holes(one.values, good) for one in (melanin, blood)]
+        layers.append(fill_holes(change, known))
+        texels = whole.model.valid
+        painted = whole.person.paint(np.stack(layers, axis=-1))[texels].astype(np.float64)
+        melanin_there, blood_there, change_there = np.moveaxis(painted, -1, 0)
         return _MovingColor(
-            dataclasses.replace(model, r_d=shown.astype(np.float32)),
-            melanin.values[good].astype(np.float64),
-            blood.values[good].astype(np.float64),
-            fill_holes(change, known)[good],
-            good,
+            dataclasses.replace(whole.model, r_d=shown.astype(np.float32)),
+            melanin_there,
+            blood_there,
+            change_there,
+            texels,
             float((known & good).sum() / max(good.sum(), 1)),
             color_table.build(spectra.LINEAR_SRGB, "D65", size=24, anisotropy=ANISOTROPY_SKIN),
         )
@@ -233,9 +302,18 @@ def _develop(steps: list[tuple[Rendering, ...]]) -> UInt8Array:
 
 
 def write_finished_face(
-    out: Path, face: FinishedFace, double: FusedDouble, *, errors: dict[str, str], person: str
+    out: Path,
+    face: FinishedFace,
+    double: FusedDouble,
+    moving: SkinAppearance,
+    *,
+    errors: dict[str, str],
+    folders: tuple[Path, Path],
 ) -> None:
     """Write the frames and their record into a folder, which is replaced.
+
+    The record has the consent of the subjects of both inputs; the frames are simulated if one of
+    them is.
 
     Parameters
     ----------
@@ -245,22 +323,28 @@ def write_finished_face(
         Frames of the person.
     double
         The person.
+    moving
+        Hemoglobin rig of the frames.
     errors
         Errors of what is shown, in words, by quantity.
-    person
-        Name of the folder of the person's maps, next to `out`.
+    folders
+        Folders of the maps of `double` and of `moving`, next to `out`. Their digests show whether
+        the frames are older than the maps.
     """
+    inputs = double.appearance, moving
     document = {
         "schema": SCHEMA,
-        "person": person,
+        "person": folders[0].name,
         "expression": face.expression,
         "weights": face.weights,
         "lights": LIGHT_AZIMUTHS_DEG,
         "blood_fraction": face.blood_fraction,
         "errors": errors,
         "left_out": face.left_out,
-        "source": double.appearance.source,
-        consent.CONSENT_KEY: consent.merge_consent(double.appearance),
+        "seed": face.seed,
+        "inputs": {folder.name: hash_document(folder) for folder in folders},
+        "source": "simulated" if "simulated" in {one.source for one in inputs} else "measured",
+        consent.CONSENT_KEY: consent.merge_consent(*inputs),
     }
     with replace_folder_atomically(out) as fresh:
         (fresh / SHEET_FILE).write_bytes(encode_sheet(face.frames))

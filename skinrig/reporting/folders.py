@@ -10,6 +10,7 @@ from typing import Any
 from capture.calibration.store import SCHEMA as CALIBRATION_SCHEMA
 from model import store
 from model.skin import SkinAppearance
+from skinrig import consent
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE as FACE_DOCUMENT
 from skinrig.reporting.sections import images as image_section
 
@@ -66,15 +67,19 @@ class ReportInputs:
 
     def _describe_source(self) -> str:
         """Return whether people were measured, by the sources that the folders record."""
-        sources = []
+        sources, has_people = [], False
         for path in (*self.appearances.values(), *self.sessions, *self.faces):
             for name in (store.DOCUMENT_FILE, "session.json", FACE_DOCUMENT):
                 with contextlib.suppress(OSError, ValueError, AttributeError):
-                    sources.append(json.loads((path / name).read_bytes()).get("source"))
+                    document = json.loads((path / name).read_bytes())
+                    sources.append(document.get("source"))
+                    has_people |= bool(document.get(consent.CONSENT_KEY))
         if not sources:
             return ""
         simulated = sources.count("simulated")
         if simulated == len(sources):
+            if has_people:
+                return " All data are simulated, but some of their inputs are measured."
             return " All data are simulated; no person was measured."
         if simulated:
             return f" {simulated} of the {len(sources)} sets of maps and sessions are simulated."

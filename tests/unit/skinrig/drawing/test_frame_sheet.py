@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from skinrig.drawing.frame_sheet import (
+    FIRST_LIGHT,
     FRAME_PX,
     N_LIGHTS,
     N_STEPS,
@@ -51,7 +52,11 @@ def test_encoded_sheet_keeps_every_frame(frames):
 
 def test_style_reaches_each_light_and_the_last_step():
     style = build_style()
-    rows = [float(part) for part in re.findall(r"translate:0 -([0-9.]+)%", style)]
+    before, supported = style.split("@supports selector(:has(*)){")
+    assert f"translate:0 -{100 * FIRST_LIGHT / N_LIGHTS:g}%" in before
+    assert "fieldset,.player .play{display:none}" in before
+    assert "animation" not in before
+    rows = [float(part) for part in re.findall(r"translate:0 -([0-9.]+)%", supported)]
     np.testing.assert_allclose(rows, 100.0 * np.arange(N_LIGHTS) / N_LIGHTS)
     assert float(re.search(r"translateX\(-([0-9.]+)%\)", style)[1]) == pytest.approx(
         100.0 * (1.0 - 1.0 / N_STEPS)

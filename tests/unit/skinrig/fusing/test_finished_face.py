@@ -1,27 +1,36 @@
 """A fused person's face: light, blood and movement of the frames, on a head that is known."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fixtures.finished_faces import HEAD_BLOOD, HEAD_MELANIN, HEAD_PX, matte_head
+from fixtures.head_scans import draw_scan
 
-from model import color_table, spectra
+from model import color_table, spectra, store
 from model.facial_color import HemoglobinRig
 from model.facial_color.document import RIG_DOCUMENT, to_maps
 from model.skin import SkinAppearance
+from model.skin_reflectance import assemble
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from rigsim.geometry.atlas import unwrap
+from skinrig.appearances.contents import hash_document
 from skinrig.fusing import finished_face
 from skinrig.fusing.finished_face import (
     LIGHT_AZIMUTHS_DEG,
+    complete_skin,
     render_finished_face,
     write_finished_face,
 )
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE, SHEET_FILE
 from skinrig.fusing.sources import FusionInputError
+from skinrig.unmeasured.head_fit import fit_head
+from skinrig.unmeasured.person import HEAD_FILE
 
 FRAME_PX = (48, 54)
+R_D = (0.4, 0.3, 0.2)
 BACKGROUND = (40, 42, 45)
 
 
@@ -126,15 +135,88 @@ def test_unknown_expression_is_refused(head):
         render_finished_face(person(head), moving(HEAD_BLOOD), expression="smile", seed=0)
 
 
-def test_written_folder_names_person_and_omissions(head, tmp_path):
+def write_record(out, double, blood):
+    """Write a face of these appearances; return its record."""
     face = finished_face.FinishedFace(
-        np.zeros((5, 5, 270, 240, 3), np.uint8), "anger", (0.0, 1.0), 0.5, (("eyes", "none"),)
+        np.zeros((5, 5, 270, 240, 3), np.uint8), "anger", (0.0, 1.0), 0.5, 7, (("eyes", "none"),)
     )
+    folders = out.parent / "double", out.parent / "moving"
+    for folder, one in zip(folders, (double, blood), strict=True):
+        store.write(folder, one)
+    person_maps = SimpleNamespace(appearance=double)
+    write_finished_face(out, face, person_maps, blood, errors={"normals": "1.3°"}, folders=folders)
+    return json.loads((out / DOCUMENT_FILE).read_text(encoding="utf-8"))
+
+
+def test_written_folder_names_person_and_omissions(head, tmp_path):
     out = tmp_path / "face"
-    write_finished_face(out, face, person(head), errors={"normals": "1.3°"}, person="double")
+    document = write_record(out, head[0], moving(HEAD_BLOOD))
     assert {path.name for path in out.iterdir()} == {DOCUMENT_FILE, SHEET_FILE}
-    document = json.loads((out / DOCUMENT_FILE).read_text(encoding="utf-8"))
     assert document["person"] == "double"
     assert document["errors"] == {"normals": "1.3°"}
     assert document["left_out"] == [["eyes", "none"]]
     assert document["source"] == "simulated"
+    assert document["seed"] == 7
+    assert document["inputs"] == {
+        name: hash_document(tmp_path / name) for name in ("double", "moving")
+    }
+
+
+def test_consent_of_both_inputs_is_recorded(head, tmp_path):
+    subjects = [
+        {"pseudonym": name, "consent_scope": [use], "consent_expires": None}
+        for name, use in (("P1", "publication"), ("P2", "research"))
+    ]
+    double, blood = (
+        dataclasses.replace(one, source="measured", parameters={"consent": [subject]})
+        for one, subject in zip((head[0], moving(HEAD_BLOOD)), subjects, strict=True)
+    )
+    document = write_record(tmp_path / "face", double, blood)
+    assert document["consent"] == subjects
+    assert document["source"] == "measured"
+    simulated = dataclasses.replace(blood, source="simulated")
+    document = write_record(tmp_path / "face", double, simulated)
+    assert document["source"] == "simulated"
+    assert document["consent"] == subjects
+
+
+def test_unmeasured_texels_have_normals_of_the_mesh(head):
+    """Rationale: false or mean normals that face away from the camera render black."""
+    appearance, covered = head
+    hole = np.zeros_like(covered)
+    hole[HEAD_PX // 2, HEAD_PX // 2 : HEAD_PX // 2 + 4] = True
+    assert covered[hole].all()
+    model = assemble(appearance)
+    normals, r_d = model.normals.copy(), model.r_d.copy()
+    normals[hole] *= -1.0
+    r_d[hole] = 0.0
+    valid = model.valid & ~hole
+    for known in (valid, model.valid):
+        damaged = dataclasses.replace(model, normals=normals, r_d=r_d, valid=known)
+        found = complete_skin(appearance, damaged, seed=0).model
+        assert found.valid[covered].all()
+        cosine = np.einsum("nk,nk->n", found.normals[hole], model.normals[hole])
+        assert cosine.min() > 0.9
+        if known is valid:
+            np.testing.assert_allclose(found.r_d[hole], model.r_d[hole], rtol=1e-5)
+        kept = valid & covered
+        np.testing.assert_array_equal(found.normals[kept], model.normals[kept])
+
+
+@pytest.mark.long
+def test_crown_and_neck_continue_the_scan():
+    scan, _ = draw_scan(300)
+    appearance, _ = matte_head(scan)
+    files = {**appearance.files, HEAD_FILE: fit_head(scan).to_bytes()}
+    model = assemble(appearance)
+    whole = complete_skin(dataclasses.replace(appearance, files=files), model, seed=0)
+    height = whole.person.mesh.vertices_mm[:, 1]
+    assert height.max() > scan.vertices_mm[:, 1].max() + 5.0
+    assert height.min() < scan.vertices_mm[:, 1].min() - 5.0
+    everywhere = unwrap(whole.person.mesh, HEAD_PX).covered
+    assert whole.model.valid[everywhere].all()
+    assert (everywhere & ~model.valid).sum() > 50
+    np.testing.assert_allclose(
+        whole.model.r_d[everywhere], np.broadcast_to(R_D, (everywhere.sum(), 3)), rtol=1e-3
+    )
+    assert "crown, neck and sides of the head" in dict(whole.person.summary())
