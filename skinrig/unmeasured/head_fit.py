@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from model.checks.files import read_arrays
 from reconstruction.scan.face_template import FaceTemplate
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.scan.template_wrapping import wrap_template
@@ -37,17 +36,6 @@ MAX_TURN_RAD: Final = 0.35
 """Largest rotation of a head that the drawn eyes, which look along z, allow."""
 
 _ARRAYS: Final = ("vertices_mm", "stderr_mm", "measured")
-_DAMAGES: Final = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    EOFError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""Errors by which NumPy and zipfile report damaged files."""
 
 
 class HeadFitError(ValueError):
@@ -93,9 +81,10 @@ class FittedHead:
             If it is damaged; the message has the name of the file.
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                vertices, stderr, measured = (arrays[key] for key in _ARRAYS)
-        except _DAMAGES as error:
+            arrays = read_arrays(data)
+            vertices, stderr = (np.asarray(arrays[key], np.float64) for key in _ARRAYS[:2])
+            measured = np.asarray(arrays[_ARRAYS[2]], bool)
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise HeadFitError(
                 f"{name}: not readable ({error}); run `skinrig fuse` again"
             ) from error
@@ -108,7 +97,7 @@ class FittedHead:
                 f"expected finite numbers for {shape[0]} x {shape[1]} points; run `skinrig fuse` "
                 "again"
             )
-        return cls(vertices.astype(np.float64), stderr.astype(np.float64), measured.astype(bool))
+        return cls(vertices, stderr, measured)
 
     def draw(self) -> tuple[Mesh, Float64Array]:
         """Return the head on a grid of `DRAWN_GRID`, and the standard error of its vertices.
