@@ -32,7 +32,7 @@ UNMEASURED_KEY: Final = "unmeasured"
 """Key in `parameters`: parts that no rig measured, with their source and errors."""
 FACE_PARTS: Final = ("eyes", "lids", "lashes", "brows")
 HAIR_PART: Final = "hair"
-REGIONS: Final = ("crown", "neck", "sides of the head", "upper face", "lower face")
+HEAD_REGIONS: Final = ("crown", "neck", "sides of the head", "upper face", "lower face")
 """Regions of the mean head, see `_divide`."""
 CROWN_MM: Final = 88.0
 NECK_MM: Final = -75.0
@@ -145,7 +145,7 @@ class DisplayedPerson:
     stderr_mm : ndarray of float64, shape (V,)
         Standard error of the filled vertices across the surface, 0 for others.
     fractions
-        Filled fraction of the whole surface, "head", and of `REGIONS`, by area, 0 to 1.
+        Filled fraction of the whole surface, "head", and of `HEAD_REGIONS`, by area, 0 to 1.
     closed
         The scan with closed holes.
     chart
@@ -178,7 +178,7 @@ class DisplayedPerson:
     @property
     def regions(self) -> tuple[str, ...]:
         """Regions of the surface that are the fitted head's, at least in part."""
-        return tuple(n for n in REGIONS if self.fractions.get(n, 0.0) >= MIN_NAMED_FRACTION)
+        return tuple(n for n in HEAD_REGIONS if self.fractions.get(n, 0.0) >= MIN_NAMED_FRACTION)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -351,7 +351,7 @@ def _divide(mesh: Mesh, measured: int, fitted: FittedHead) -> dict[str, float]:
     region = np.select(chosen, range(len(chosen)), len(chosen))
     is_filled = np.arange(len(area)) >= measured
     found = {"head": float(area[is_filled].sum() / area.sum())}
-    for number, name in enumerate(REGIONS):
+    for number, name in enumerate(HEAD_REGIONS):
         here = region == number
         whole = float(area[here].sum())
         found[name] = float(area[here & is_filled].sum()) / whole if whole > 0.0 else 0.0

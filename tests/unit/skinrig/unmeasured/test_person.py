@@ -15,6 +15,7 @@ from reconstruction.scan.repair import TriangleMesh
 from rigsim.face_parts import eyelids
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.unmeasured import person as assembly
 from skinrig.unmeasured import rim
 from skinrig.unmeasured.head_fit import FittedHead, HeadFitError, fit_head
 from skinrig.unmeasured.person import FACE_PARTS, HEAD_FILE, assemble_person, fit_unmeasured
@@ -153,17 +154,15 @@ def test_scan_without_eyes_gets_no_eyes():
     assert "upper face 100 %" in dict(person.added())[", ".join(person.names)]
 
 
-def test_scan_below_hairline_has_brows_alone(scanned):
+def test_scan_below_hairline_has_brows_alone(scanned, monkeypatch):
     """Without space in the texture nothing is added around the scan."""
     scan, _, fitted, _ = scanned
     low = crop_below(scan, 62.0)
     front = (low.vertices_mm[low.faces][..., 2] > -40.0).all(axis=1)
     low = build_mesh(low.vertices_mm, low.faces[front], low.uv)
-    points = low.vertices_mm
-    full = (points[:, :2] - points[:, :2].min(axis=0)) / np.ptp(points[:, :2], axis=0)
-    mesh = build_mesh(points, low.faces, full)
+    monkeypatch.setattr(assembly, "place_disc", lambda *_, **__: None)
     appearance = SkinAppearance({}, "simulated", {}, files={HEAD_FILE: fitted.to_bytes()})
-    person = assemble_person(appearance, ClosedMesh(mesh, (), ()), 0)
+    person = assemble_person(appearance, ClosedMesh(low, (), ()), 0)
     assert person.names == FACE_PARTS
     assert person.parts.hair.counts[2] == 0
     assert set(dict(person.omitted())) == {"crown and neck", "hair of the scalp"}
