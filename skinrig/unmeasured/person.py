@@ -289,7 +289,7 @@ def assemble_person(appearance: SkinAppearance, closed: ClosedMesh, seed: int) -
         left_out.append(("eyes and hair", str(error)))
         return replace(person, left_out=tuple(left_out))
     hair = _draw_hair(mesh, lids, fitted, _preset(appearance), seed)
-    names = FACE_PARTS
+    names: tuple[str, ...] = FACE_PARTS
     if hair.counts[2]:
         names = (*names, HAIR_PART)
     else:
