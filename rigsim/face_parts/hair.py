@@ -69,7 +69,8 @@ class Hair:
     counts
         Number of curves of each of `HAIR_KINDS`.
     coverage
-        Fraction of the skin that hair covers at each vertex of the mesh, shape (V,).
+        Fraction of the skin that the scalp's hair and brows cover at each vertex of the mesh,
+        shape (V, 2).
     eumelanin, pheomelanin
         Concentrations, in units of `EUMELANIN_PER_RADIUS`.
     iris_melanin
@@ -107,6 +108,11 @@ def draw_hair(
     lids
         Lids of both eyes on the mesh; None: those of the grid of
         `rigsim.subject.head.build_head`.
+
+    Returns
+    -------
+    Hair
+        Without a lock on the scalp if the mesh ends below the hairline.
 
     Raises
     ------
@@ -243,6 +249,8 @@ def _scalp(mesh: Mesh, rng: np.random.Generator) -> tuple[Float64Array, Int64Arr
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
     )
     area = area * (_hairline(corners.mean(axis=1)) > -1.0)
+    if not area.any():
+        return np.zeros((0, CURVE_POINTS, 3)), np.zeros(0, np.int64)
     face = rng.choice(len(area), SCALP_LOCKS, p=area / area.sum())
     r, s = rng.uniform(size=(2, SCALP_LOCKS))
     swap = r + s > 1.0
@@ -284,5 +292,5 @@ def _coverage(mesh: Mesh) -> Float32Array:
     soft = np.prod([1.0 / (1.0 + np.exp(-2.0 * one)) for one in inside], axis=0)
     brow = 0.45 * soft * np.exp(-(((points[:, 1] - center) / (0.9 * half)) ** 2))
     brow *= points[:, 2] > -55.0
-    covered = np.maximum(scalp, brow)
+    covered = np.stack([scalp, brow], axis=-1)
     return np.where(covered < 0.01, 0.0, covered).astype(np.float32)

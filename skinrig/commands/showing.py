@@ -239,6 +239,7 @@ def view(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures"
             f"{shapes}; open it in a browser"
         )
+    console.print_each("not measured", (f"{what}: {how}" for what, how in scene.added))
     console.print_omissions(scene.left_out)
     if port is None:
         console.print_document("skinrig.view/1", document)

@@ -97,6 +97,8 @@ class FusedDouble:
     measured: Measurements
     checks: tuple[RigCheck, ...]
     patch: PlacedPatch | None = None
+    undrawn: tuple[tuple[str, str], ...] = ()
+    """Parts for display that could not be added, with reasons."""
 
     @property
     def all_checks(self) -> tuple[RigCheck | PatchCheck, ...]:
@@ -111,7 +113,8 @@ class FusedDouble:
     @property
     def left_out(self) -> tuple[tuple[str, str], ...]:
         """What was omitted, with reasons."""
-        return (*self.measured.left_out, *(() if self.patch is None else self.patch.left_out))
+        placed = () if self.patch is None else self.patch.left_out
+        return (*self.measured.left_out, *placed, *self.undrawn)
 
     @property
     def contradiction(self) -> str | None:
@@ -152,7 +155,8 @@ def fuse(
     if dome is not None and not {UNMEASURED_NAME, "dome"} & set(given.without):
         report = progress or (lambda _step: None)
         whole = add_unmeasured(found.appearance, dome.path, given.landmarks, progress=report)
-        found = replace(found, appearance=whole)
+        undrawn = whole.left_out[len(found.appearance.left_out) :]
+        found = replace(found, appearance=whole, undrawn=undrawn)
     store.write(out, found.appearance)
     return found
 

@@ -14,6 +14,7 @@ from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig.appearances.contents import FUSION_KEY, hash_document
 from skinrig.appearances.dynamic import DYNAMIC_KIND, WRINKLES, describe_parts
 from skinrig.errors import UsageError
+from skinrig.fusing.unmeasured import drop_unmeasured
 
 RIG_NAMES: Final = ("flash", "dome", "gradient", "probe", WRINKLES)
 """Rigs whose maps can be fused, in the order of the table of inputs; the dome's wrinkles last."""
@@ -119,7 +120,8 @@ def read_sources(paths: Sequence[Path]) -> Sources:
             raise FusionInputError(
                 f"{folder}: got a second {rig} folder after {found[rig].path}; give one per rig"
             )
-        found[rig] = Source(rig, folder, appearance)
+        # the result gets its own parts for display, or none
+        found[rig] = Source(rig, folder, drop_unmeasured(appearance))
     if not {"flash", "dome"} & found.keys():
         raise FusionInputError(
             f"{', '.join(map(str, paths)) or 'none'}: got no colors of a face, expected maps of "

@@ -3,18 +3,47 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from model.skin import SkinAppearance
 from reconstruction.scan.repair import ScanMeshError
+from rigsim.geometry.mesh import MeshError
 from skinrig.appearances import face_textures
 from skinrig.appearances.contents import list_assumptions
-from skinrig.rendering.geometry import MESH_FILES
+from skinrig.rendering.geometry import MESH_FILES, GeometryError
 from skinrig.unmeasured.head_fit import HeadFitError
-from skinrig.unmeasured.person import UNMEASURED_KEY, UNMEASURED_PARTS, fit_unmeasured
+from skinrig.unmeasured.person import HEAD_FILE, UNMEASURED_KEY, fit_unmeasured
 
 UNMEASURED_NAME: Final = "unmeasured"
 """Name that leaves these parts out."""
+UNMEASURED_ROW: Final = "unmeasured parts"
+"""Beginning of the names of such parts among what an appearance leaves out."""
+UNMEASURED_SOURCE: Final = (
+    "not measured; for display, the mean of simulated heads, fitted to the scan"
+)
+"""End of what an appearance with such parts assumes."""
+
+
+def drop_unmeasured(appearance: SkinAppearance) -> SkinAppearance:
+    """Return an appearance without the parts that `add_unmeasured` added, and their records.
+
+    Parameters
+    ----------
+    appearance
+        Any; one without such parts stays as it is.
+    """
+    assumed = [one for one in list_assumptions(appearance) if not one.endswith(UNMEASURED_SOURCE)]
+    left_out = tuple(row for row in appearance.left_out if not row[0].startswith(UNMEASURED_ROW))
+    known = {UNMEASURED_KEY} & appearance.parameters.keys() | {HEAD_FILE} & appearance.files.keys()
+    if not known and left_out == appearance.left_out:
+        return appearance
+    parameters: dict[str, Any] = {
+        key: value for key, value in appearance.parameters.items() if key != UNMEASURED_KEY
+    }
+    if "assumed" in parameters:
+        parameters["assumed"] = assumed
+    files = {name: data for name, data in appearance.files.items() if name != HEAD_FILE}
+    return replace(appearance, files=files, parameters=parameters, left_out=left_out)
 
 
 def add_unmeasured(
@@ -26,7 +55,8 @@ def add_unmeasured(
 ) -> SkinAppearance:
     """Return an appearance with the mean head fitted to its mesh, in a file of its own.
 
-    No map and no other file changes. An appearance without a mesh stays as it is.
+    No map and no other file changes. An appearance without a mesh stays as it is. Parts that cannot
+    be added are left out with the reason.
 
     Parameters
     ----------
@@ -45,13 +75,14 @@ def add_unmeasured(
     progress("fit the mean head, for parts that no rig measured")
     points = None if landmarks is None else face_textures.read(dome, landmarks).landmarks
     try:
-        files, described = fit_unmeasured(appearance, points)
-    except (HeadFitError, ScanMeshError) as error:
-        return replace(
-            appearance, left_out=(*appearance.left_out, ("unmeasured parts", str(error)))
-        )
-    names = ", ".join(UNMEASURED_PARTS)
-    assumed = f"{names}: not measured; for display, the mean of simulated heads, fitted to the scan"
+        files, described, missing = fit_unmeasured(appearance, points)
+    except (HeadFitError, ScanMeshError, MeshError, GeometryError) as error:
+        return replace(appearance, left_out=(*appearance.left_out, (UNMEASURED_ROW, str(error))))
+    rows = [(f"{UNMEASURED_ROW}: {what}", why) for what, why in missing]
+    appearance = replace(appearance, left_out=(*appearance.left_out, *rows))
+    if not files:
+        return appearance
+    assumed = f"{', '.join(described['parts'])}: {UNMEASURED_SOURCE}"
     return replace(
         appearance,
         files={**appearance.files, **files},

@@ -75,22 +75,31 @@ class ClosedMesh:
                 _paint(layer, chart)
         return layers.reshape(values.shape)
 
+    def added(self) -> tuple[tuple[str, str], ...]:
+        """Return the surface that was not measured, with its source."""
+        if not self.charts:
+            return ()
+        lengths = [chart.patch.length_mm for chart in self.charts]
+        text = (
+            f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
+            f"{min(lengths):.0f} to {max(lengths):.0f} mm circumference "
+            "not measured; closed by smooth patches with colors of their rims"
+        )
+        return (("surface in holes of the scan", text),)
+
+    def omitted(self) -> tuple[tuple[str, str], ...]:
+        """Return the holes that stay open, with reasons."""
+        if not self.open_loops_mm:
+            return ()
+        text = (
+            f"the texture has no space for {len(self.open_loops_mm)} of up to "
+            f"{max(self.open_loops_mm):.0f} mm circumference"
+        )
+        return (("open holes", text),)
+
     def summary(self) -> tuple[tuple[str, str], ...]:
-        """Return omissions about holes, with reasons."""
-        rows = {}
-        if self.charts:
-            lengths = [chart.patch.length_mm for chart in self.charts]
-            rows["surface in holes of the scan"] = (
-                f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
-                f"{min(lengths):.0f} to {max(lengths):.0f} mm circumference "
-                "not measured; closed by smooth patches with colors of their rims"
-            )
-        if self.open_loops_mm:
-            rows["open holes"] = (
-                f"the texture has no space for {len(self.open_loops_mm)} of up to "
-                f"{max(self.open_loops_mm):.0f} mm circumference"
-            )
-        return tuple(rows.items())
+        """Return what was not measured in holes, closed or open."""
+        return (*self.added(), *self.omitted())
 
 
 def close_holes(mesh: Mesh) -> ClosedMesh:
@@ -167,7 +176,7 @@ def _take(taken: BoolArray, center: Float64Array, radius: float) -> None:
 
 def _paint(layer: Float32Array, chart: PatchChart) -> None:
     """Draw a patch into a map (H, W, C), row 0 at the top, in place."""
-    from scipy.interpolate import LinearNDInterpolator
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
     height, width, _ = layer.shape
     if min(height, width) < 2:  # one value for the whole face
@@ -194,5 +203,9 @@ def _paint(layer: Float32Array, chart: PatchChart) -> None:
     polygon = np.concatenate([chart.patch.disc, 1.5 * chart.patch.disc[: len(chart.patch.rim)]])
     both = np.concatenate([values, values[: len(chart.patch.rim)]])
     found = LinearNDInterpolator(polygon, both)(within[inside])
+    # the polygon of three or four vertices ends within the circle
+    beyond = np.isnan(found).any(axis=-1)
+    if beyond.any():
+        found[beyond] = NearestNDInterpolator(polygon, both)(within[inside][beyond])
     block = layer[i[0] : i[-1] + 1, j[0] : j[-1] + 1]
     block[inside] = found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,6 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from model.checks.files import read_arrays
 from reconstruction.scan.face_template import FaceTemplate
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.scan.template_wrapping import wrap_template
@@ -81,9 +81,10 @@ class FittedHead:
             If it is damaged; the message has the name of the file.
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                vertices, stderr, measured = (arrays[key] for key in _ARRAYS)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            arrays = read_arrays(data)
+            vertices, stderr = (np.asarray(arrays[key], np.float64) for key in _ARRAYS[:2])
+            measured = np.asarray(arrays[_ARRAYS[2]], bool)
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise HeadFitError(
                 f"{name}: not readable ({error}); run `skinrig fuse` again"
             ) from error
@@ -96,7 +97,7 @@ class FittedHead:
                 f"expected finite numbers for {shape[0]} x {shape[1]} points; run `skinrig fuse` "
                 "again"
             )
-        return cls(vertices.astype(np.float64), stderr.astype(np.float64), measured.astype(bool))
+        return cls(vertices, stderr, measured)
 
     def draw(self) -> tuple[Mesh, Float64Array]:
         """Return the head on a grid of `DRAWN_GRID`, and the standard error of its vertices.
@@ -117,6 +118,8 @@ class FittedHead:
     def locate_eye(self, side: float) -> tuple[Float64Array, Float64Array]:
         """Return the rotation and the translation from the mean head's eye to the person's.
 
+        Eyes keep the mean head's size.
+
         Parameters
         ----------
         side
@@ -129,21 +132,36 @@ class FittedHead:
             A point p of the mean head is at ``rotation @ p + translation_mm``.
         """
         mean = mean_head(FIT_GRID).vertices_mm.astype(np.float64)
-        away = mean - np.array(EYE_MM) * (side, 1.0, 1.0)
-        weight = np.exp(-0.5 * np.sum((away / EYE_REACH_MM) ** 2, axis=1))
-        return _fit_rigid(mean, self.vertices_mm.reshape(-1, 3), weight)
+        rotation, a, b, _ = _fit_similarity(
+            mean, self.vertices_mm.reshape(-1, 3), _weigh_eye(mean, side)
+        )
+        return rotation, b - rotation @ a
 
-    def locate_head(self) -> tuple[Float64Array, Float64Array]:
-        """Return the rotation and the translation from the mean head to the person's.
+    def measured_near_eye(self, side: float) -> float:
+        """Return the fraction of the surroundings of an eye where the scan has data, 0 to 1.
+
+        Parameters
+        ----------
+        side
+            As of `locate_eye`.
+        """
+        weight = _weigh_eye(mean_head(FIT_GRID).vertices_mm.astype(np.float64), side)
+        return float(weight @ self.measured.reshape(-1) / weight.sum())
+
+    def locate_head(self) -> tuple[Float64Array, Float64Array, float]:
+        """Return the similarity from the mean head to the person's.
 
         Returns
         -------
         rotation : ndarray of float64, shape (3, 3)
         translation_mm : ndarray of float64, shape (3,)
+        scale : float
+            A point p of the mean head is at ``scale * rotation @ p + translation_mm``.
         """
         mean = mean_head(FIT_GRID).vertices_mm.astype(np.float64)
         weight = self.measured.reshape(-1) / self.stderr_mm.reshape(-1) ** 2
-        return _fit_rigid(mean, self.vertices_mm.reshape(-1, 3), weight)
+        rotation, a, b, scale = _fit_similarity(mean, self.vertices_mm.reshape(-1, 3), weight)
+        return rotation, b - scale * rotation @ a, scale
 
 
 @lru_cache(maxsize=2)
@@ -199,13 +217,22 @@ def fit_head(
     return fit
 
 
-def _fit_rigid(
+def _weigh_eye(mean_mm: Float64Array, side: float) -> Float64Array:
+    """Return the weights of the mean head's vertices around an eye, shape (V,)."""
+    away = mean_mm - np.array(EYE_MM) * (side, 1.0, 1.0)
+    return np.asarray(np.exp(-0.5 * np.sum((away / EYE_REACH_MM) ** 2, axis=1)))
+
+
+def _fit_similarity(
     source: Float64Array, target: Float64Array, weight: Float64Array
-) -> tuple[Float64Array, Float64Array]:
-    """Return rotation and translation of least weighted squares (Kabsch 1976)."""
+) -> tuple[Float64Array, Float64Array, Float64Array, float]:
+    """Return rotation, both centroids and scale of least weighted squares (Umeyama 1991)."""
     weight = weight / weight.sum()
     a, b = weight @ source, weight @ target
-    u, _, vt = np.linalg.svd((target - b).T @ (weight[:, None] * (source - a)))
+    spread = weight[:, None] * (source - a)
+    covariance = (target - b).T @ spread
+    u, _, vt = np.linalg.svd(covariance)
     flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * flip) @ vt
-    return rotation, b - rotation @ a
+    scale = float(np.sum(rotation * covariance) / np.sum(spread * (source - a)))
+    return rotation, a, b, scale

@@ -24,6 +24,10 @@ MIN_MARGIN_POINTS: Final = 6
 """Least number of vertices along a lid's margin."""
 MIN_MOVE_MM: Final = 1e-3
 """Displacement below which a vertex does not belong to the lids."""
+OPENING_SKIN_MM: Final = 1.0
+"""Displacement from which skin must be on the scan: with less, it is far from the lids."""
+MIN_MEASURED_FRACTION: Final = 0.5
+"""Least measured fraction of the surroundings of an eye, weighted as they locate it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +43,9 @@ class _Cut:
     """Whether a vertex is a copy on the lower side of the cut, shape (V,)."""
 
 
-def cut_lids(mesh: Mesh, fitted: FittedHead) -> tuple[Mesh, tuple[Eyelids, Eyelids]]:
+def cut_lids(
+    mesh: Mesh, fitted: FittedHead, filled: BoolArray
+) -> tuple[Mesh, tuple[Eyelids, Eyelids]]:
     """Cut the lids of both eyes, on the image's right (x > 0) and left.
 
     Parameters
@@ -48,6 +54,8 @@ def cut_lids(mesh: Mesh, fitted: FittedHead) -> tuple[Mesh, tuple[Eyelids, Eyeli
         Scan with closed eyes, mm. Its vertices keep their numbers; new ones follow.
     fitted
         Mean head that was fitted to it.
+    filled
+        Whether a vertex is the fitted head's, not the scan's, shape (V,).
 
     Returns
     -------
@@ -59,7 +67,7 @@ def cut_lids(mesh: Mesh, fitted: FittedHead) -> tuple[Mesh, tuple[Eyelids, Eyeli
     Raises
     ------
     rigsim.face_parts.eyelids.EyelidError
-        If the scan has no lids where the fitted head has them.
+        If the scan has no lids where the fitted head has them, or does not reach them.
     """
     lids, shifts = [], []
     for side in (1.0, -1.0):
@@ -71,12 +79,26 @@ def cut_lids(mesh: Mesh, fitted: FittedHead) -> tuple[Mesh, tuple[Eyelids, Eyeli
         vertices[: len(at)] = mesh.vertices_mm
         # both sides of the cut at one position, for the normals of the closed surface
         mesh = build_mesh(vertices, cut.faces, cut.uv)
-        lids.append(_open_one(cut, rotation, shift, mirror))
+        opened = _open_one(cut, rotation, shift, mirror)
+        _require_measured(opened, filled, fitted.measured_near_eye(side))
+        lids.append(opened)
         shifts.append((np.flatnonzero(cut.is_lower), OVERLAP_MM * rotation[:, 1]))
     moved = mesh.vertices_mm.copy()
     for rows, offset in shifts:
         moved[rows] += offset.astype(np.float32)
     return replace(mesh, vertices_mm=moved), (lids[0], lids[1])
+
+
+def _require_measured(lids: Eyelids, filled: BoolArray, fraction: float) -> None:
+    """Raise if lids are not on the scan: a drawn face is not measured skin that opens."""
+    opens = np.linalg.norm(lids.opening_mm, axis=1) > OPENING_SKIN_MM
+    known = lids.vertices[opens & (lids.vertices < len(filled))]
+    if filled[known].any() or fraction < MIN_MEASURED_FRACTION:
+        raise EyelidError(
+            f"mesh: got a scan of {100 * fraction:.0f} % of the skin around an eye, and "
+            f"{np.count_nonzero(filled[known])} vertices of the mean head among "
+            f"{len(known)} of its lids, expected a scan of both; omit the eyes"
+        )
 
 
 def _near(points: Float64Array) -> BoolArray:

@@ -14,7 +14,13 @@ from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.subject.pigment import nearest_preset
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 from skinrig.rendering.geometry import read_own_mesh
-from skinrig.rendering.hole_patches import GRID_CELLS, PATCH_MARGIN, ClosedMesh, place_disc
+from skinrig.rendering.hole_patches import (
+    GRID_CELLS,
+    PATCH_MARGIN,
+    ClosedMesh,
+    close_holes,
+    place_disc,
+)
 from skinrig.unmeasured.completion import CompletedHead, complete_head
 from skinrig.unmeasured.head_fit import FittedHead, fit_head
 from skinrig.unmeasured.lids import cut_lids
@@ -24,8 +30,16 @@ HEAD_FILE: Final = "unmeasured_head.npz"
 """Mean head fitted to the scan, in an appearance."""
 UNMEASURED_KEY: Final = "unmeasured"
 """Key in `parameters`: parts that no rig measured, with their source and errors."""
-UNMEASURED_PARTS: Final = ("eyes", "lids", "lashes", "brows", "hair", "crown", "neck")
-"""Parts that the fitted head adds for display."""
+FACE_PARTS: Final = ("eyes", "lids", "lashes", "brows")
+HAIR_PART: Final = "hair"
+HEAD_REGIONS: Final = ("crown", "neck", "sides of the head", "upper face", "lower face")
+"""Regions of the mean head, see `_divide`."""
+CROWN_MM: Final = 88.0
+NECK_MM: Final = -75.0
+SIDES_MM: Final = -45.0
+"""Heights above which the crown begins and below which the neck does; depth of the sides."""
+MIN_NAMED_FRACTION: Final = 0.005
+"""Least filled fraction of a region that is named."""
 MIN_CHART_RADIUS: Final = 0.02
 """Least radius of the added surface's disc in the texture, texture units."""
 MELANIN_MAP: Final = "melanin"
@@ -43,11 +57,14 @@ class FaceParts:
         Brows, lashes and hair of the scalp.
     label
         What the parts are, for display.
+    names
+        Names of the parts.
     """
 
     lids: tuple[Eyelids, Eyelids]
     hair: Hair
     label: str
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +144,8 @@ class DisplayedPerson:
         Whether the position of a vertex is the fitted head's; other vertices are on the scan.
     stderr_mm : ndarray of float64, shape (V,)
         Standard error of the filled vertices across the surface, 0 for others.
+    fractions
+        Filled fraction of the whole surface, "head", and of `HEAD_REGIONS`, by area, 0 to 1.
     closed
         The scan with closed holes.
     chart
@@ -140,6 +159,7 @@ class DisplayedPerson:
     mesh: Mesh
     filled: BoolArray
     stderr_mm: Float64Array
+    fractions: Mapping[str, float]
     closed: ClosedMesh
     chart: HeadChart | None
     parts: FaceParts | None
@@ -155,27 +175,45 @@ class DisplayedPerson:
         drawn = self.closed.paint(values)
         return drawn if self.chart is None else self.chart.paint(drawn)
 
-    def summary(self) -> tuple[tuple[str, str], ...]:
-        """Return what was not measured, with reasons."""
-        rows = [*self.closed.summary(), *self.left_out]
-        if self.chart is not None:
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Regions of the surface that are the fitted head's, at least in part."""
+        return tuple(n for n in HEAD_REGIONS if self.fractions.get(n, 0.0) >= MIN_NAMED_FRACTION)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Displayed parts that no rig measured."""
+        return (*(() if self.parts is None else self.parts.names), *self.regions)
+
+    def added(self) -> tuple[tuple[str, str], ...]:
+        """Return the displayed parts that were not measured, with their source and error."""
+        rows = [*self.closed.added()]
+        if self.regions:
             errors = self.stderr_mm[self.filled]
+            each = ", ".join(
+                f"{name} {100.0 * self.fractions[name]:.0f} %" for name in self.regions
+            )
             rows.append(
                 (
-                    "crown, neck and sides of the head",
-                    "not measured; the mean head, fitted to the scan, standard error "
+                    ", ".join(self.regions),
+                    f"{100.0 * self.fractions['head']:.0f} % of the displayed surface ({each}); "
+                    "the mean head, fitted to the scan, standard error "
                     f"{errors.min():.2f} to {errors.max():.2f} mm, with colors of the scan's rim",
                 )
             )
         if self.parts is not None:
-            rows.append(("eyes, lids, lashes, brows and hair", self.parts.label))
+            rows.append((", ".join(self.parts.names), self.parts.label))
         return tuple(rows)
+
+    def omitted(self) -> tuple[tuple[str, str], ...]:
+        """Return what is not displayed, with reasons."""
+        return (*self.closed.omitted(), *self.left_out)
 
 
 def fit_unmeasured(
     appearance: SkinAppearance, landmarks_mm: Mapping[str, tuple[float, float, float]] | None
-) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Fit the mean head to the mesh of an appearance.
+) -> tuple[dict[str, bytes], dict[str, Any], tuple[tuple[str, str], ...]]:
+    """Fit the mean head to the mesh of an appearance, and try which parts it adds.
 
     Parameters
     ----------
@@ -187,25 +225,36 @@ def fit_unmeasured(
     Returns
     -------
     files
-        `HEAD_FILE`.
+        `HEAD_FILE`; none if the page can add no part.
     description
         Parts, source and errors, as JSON values.
+    left_out
+        Parts that cannot be added, with reasons.
 
     Raises
     ------
     skinrig.unmeasured.head_fit.HeadFitError, reconstruction.scan.repair.ScanMeshError
         If the mesh is not a face that looks along +z.
+    rigsim.geometry.mesh.MeshError, skinrig.rendering.geometry.GeometryError
+        If the mesh is not readable, or has no texture coordinates.
     """
-    fitted = fit_head(read_own_mesh(appearance), landmarks_mm)
+    mesh = read_own_mesh(appearance)
+    fitted = fit_head(mesh, landmarks_mm)
+    files = {HEAD_FILE: fitted.to_bytes()}
+    with_head = replace(appearance, files={**appearance.files, **files})
+    person = assemble_person(with_head, close_holes(mesh), 0)
+    if not person.names:
+        return {}, {}, person.left_out
     errors = fitted.stderr_mm[~fitted.measured]
     described = {
-        "parts": list(UNMEASURED_PARTS),
+        "parts": list(person.names),
         "measured": False,
         "source": "mean of simulated heads, fitted to the scan",
         "file": HEAD_FILE,
         "median_stderr_mm": round(float(np.median(errors)), 3) if errors.size else 0.0,
+        "filled_fraction": round(person.fractions.get("head", 0.0), 3),
     }
-    return {HEAD_FILE: fitted.to_bytes()}, described
+    return files, described, person.left_out
 
 
 def assemble_person(appearance: SkinAppearance, closed: ClosedMesh, seed: int) -> DisplayedPerson:
@@ -229,20 +278,25 @@ def assemble_person(appearance: SkinAppearance, closed: ClosedMesh, seed: int) -
     left_out = []
     scan = closed.mesh
     none = np.zeros(len(scan.vertices_mm))
-    person = DisplayedPerson(scan, none > 0.0, none, closed, None, None, ())
+    person = DisplayedPerson(scan, none > 0.0, none, {}, closed, None, None, ())
     try:
         person = _complete(person, fitted)
     except RimError as error:
         left_out.append(("crown and neck", str(error)))
     try:
-        mesh, lids = cut_lids(person.mesh, fitted)
+        mesh, lids = cut_lids(person.mesh, fitted, person.filled)
     except EyelidError as error:
         left_out.append(("eyes and hair", str(error)))
         return replace(person, left_out=tuple(left_out))
     hair = _draw_hair(mesh, lids, fitted, _preset(appearance), seed)
+    names: tuple[str, ...] = FACE_PARTS
+    if hair.counts[2]:
+        names = (*names, HAIR_PART)
+    else:
+        left_out.append(("hair of the scalp", "the displayed surface ends below the hairline"))
     label = (
-        "not measured, captured with closed eyes; from the mean head, fitted to the scan; hair and "
-        "irises are random, their colors typical of the skin's melanin"
+        "captured with closed eyes; from the mean head, fitted to the scan; hair and irises are "
+        "random, their colors typical of the skin's melanin"
     )
     added = np.zeros(len(mesh.vertices_mm) - len(person.mesh.vertices_mm))
     return replace(
@@ -250,7 +304,7 @@ def assemble_person(appearance: SkinAppearance, closed: ClosedMesh, seed: int) -
         mesh=mesh,
         filled=np.concatenate([person.filled, added > 0.0]),
         stderr_mm=np.concatenate([person.stderr_mm, added]),
-        parts=FaceParts(lids, hair, label),
+        parts=FaceParts(lids, hair, label, names),
         left_out=tuple(left_out),
     )
 
@@ -277,8 +331,31 @@ def _complete(person: DisplayedPerson, fitted: FittedHead) -> DisplayedPerson:
     filled = np.arange(len(mesh.vertices_mm)) >= count + head.rim_count
     errors = np.concatenate([np.zeros(count), head.stderr_mm])
     return replace(
-        person, mesh=mesh, filled=filled, stderr_mm=np.where(filled, errors, 0.0), chart=chart
+        person,
+        mesh=mesh,
+        filled=filled,
+        stderr_mm=np.where(filled, errors, 0.0),
+        fractions=_divide(mesh, len(trimmed.faces), fitted),
+        chart=chart,
     )
+
+
+def _divide(mesh: Mesh, measured: int, fitted: FittedHead) -> dict[str, float]:
+    """Return the fractions of the head and its regions that triangles after the first fill."""
+    corners = mesh.vertices_mm[mesh.faces].astype(np.float64)
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    rotation, shift, scale = fitted.locate_head()
+    _, y, z = ((corners.mean(axis=1) - shift) @ rotation / scale).T
+    chosen = [y > CROWN_MM, y < NECK_MM, z < SIDES_MM, y >= 0.0]
+    region = np.select(chosen, range(len(chosen)), len(chosen))
+    is_filled = np.arange(len(area)) >= measured
+    found = {"head": float(area[is_filled].sum() / area.sum())}
+    for number, name in enumerate(HEAD_REGIONS):
+        here = region == number
+        whole = float(area[here].sum())
+        found[name] = float(area[here & is_filled].sum()) / whole if whole > 0.0 else 0.0
+    return found
 
 
 def _preset(appearance: SkinAppearance) -> str:
@@ -292,25 +369,25 @@ def _preset(appearance: SkinAppearance) -> str:
 def _draw_hair(
     mesh: Mesh, lids: tuple[Eyelids, Eyelids], fitted: FittedHead, preset: str, seed: int
 ) -> Hair:
-    """Draw hair in the frame of the mean head."""
-    rotation, shift = fitted.locate_head()
+    """Draw hair in the frame of the mean head, at its size."""
+    rotation, shift, scale = fitted.locate_head()
     there = replace(
         mesh,
-        vertices_mm=((mesh.vertices_mm - shift) @ rotation).astype(np.float32),
+        vertices_mm=((mesh.vertices_mm - shift) @ rotation / scale).astype(np.float32),
         normals=(mesh.normals @ rotation).astype(np.float32),
     )
     turned = [
         replace(
             one,
-            center_mm=(one.center_mm - shift) @ rotation,
-            opening_mm=one.opening_mm @ rotation,
-            arc_mm=one.arc_mm @ rotation,
+            center_mm=(one.center_mm - shift) @ rotation / scale,
+            opening_mm=one.opening_mm @ rotation / scale,
+            arc_mm=one.arc_mm @ rotation / scale,
         )
         for one in lids
     ]
     hair = draw_hair(there, preset, seed=seed, lids=(turned[0], turned[1]))
     return replace(
         hair,
-        points_mm=(hair.points_mm @ rotation.T + shift).astype(np.float32),
-        opening_mm=(hair.opening_mm @ rotation.T).astype(np.float32),
+        points_mm=(scale * hair.points_mm @ rotation.T + shift).astype(np.float32),
+        opening_mm=(scale * hair.opening_mm @ rotation.T).astype(np.float32),
     )

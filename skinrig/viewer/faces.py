@@ -20,7 +20,7 @@ from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.hole_patches import ClosedMesh, close_holes
-from skinrig.unmeasured.person import HEAD_FILE, UNMEASURED_PARTS, DisplayedPerson, assemble_person
+from skinrig.unmeasured.person import HEAD_FILE, DisplayedPerson, assemble_person
 from skinrig.viewer.assets import face_parts as face_part_assets
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
@@ -262,13 +262,13 @@ def build_scene(
         return scene.with_assets({"facts": {"people_parts": colors}})
     found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin), progress)
     movement = "movement was not captured; blend shapes are from the file or simulated"
-    holes = () if whole is None else whole.summary()
-    left_out = [*holes, ("expressions of this face", movement)]
+    left_out = [*(() if whole is None else whole.omitted()), ("expressions of this face", movement)]
     if whole is None:
         left_out.insert(
             0, ("geometry of this face", f"{mesh_origin}; display another with --mesh FILE")
         )
-    found = found.with_assets({"left_out": tuple(left_out)})
+    added = () if whole is None else whole.added()
+    found = found.with_assets({"left_out": tuple(left_out), "added": added})
     return found if whole is None else _paint_patches(found, whole)
 
 
@@ -352,8 +352,8 @@ def _provenance(
     }
     if whole is not None and whole.charts:
         found["closed_holes"] = len(whole.charts)
-    if source.parts is not None:
-        found["not_measured"] = list(UNMEASURED_PARTS)
+    if isinstance(whole, DisplayedPerson) and whole.names:
+        found["not_measured"] = list(whole.names)
     agreed = consent.merge_consent(*source.appearances.values())
     return found | ({consent.CONSENT_KEY: consent.format_consent(agreed)} if agreed else {})
 

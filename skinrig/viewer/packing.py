@@ -181,6 +181,7 @@ def pack(scene: ViewerScene) -> PackedScene:
         "facts": scene.facts,
         "provenance": scene.provenance,
         "left_out": [list(row) for row in scene.left_out],
+        "added": [list(row) for row in scene.added],
         "quantization_error": errors,
         "bytes": offset,
     }

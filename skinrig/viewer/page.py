@@ -119,7 +119,8 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        JSON values: path, bytes, textures, blend shapes, quantization errors, omissions.
+        JSON values: path, bytes, textures, blend shapes, quantization errors, omissions, parts that
+        were not measured.
     """
     packed = pack(scene)
     text = render(packed)
@@ -134,6 +135,7 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
         "quantization_error": packed.errors,
         "provenance": dict(scene.provenance),
         "left_out": [list(row) for row in scene.left_out],
+        "added": [list(row) for row in scene.added],
     }
 
 

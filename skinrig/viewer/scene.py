@@ -95,6 +95,7 @@ class Assets(TypedDict, total=False):
     presets: Mapping[str, Mapping[str, Any]]
     facts: Mapping[str, Any]
     left_out: tuple[tuple[str, str], ...]
+    added: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,6 +176,8 @@ class ViewerScene:
         Provenance of the scene.
     left_out
         Omitted features with reasons.
+    added
+        Displayed parts that were not measured, with their source and error.
     page
         Page that shows the scene.
     """
@@ -187,6 +190,7 @@ class ViewerScene:
     facts: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     left_out: tuple[tuple[str, str], ...] = ()
+    added: tuple[tuple[str, str], ...] = ()
     page: Page = "head"
 
     def with_assets(self, assets: Assets) -> ViewerScene:
@@ -205,4 +209,6 @@ class ViewerScene:
             if double:
                 raise SceneError(f"{key}: {double[0]!r} comes from two builders")
             merged[key] = MappingProxyType({**old, **new})
-        return replace(self, **merged, left_out=(*self.left_out, *assets.get("left_out", ())))
+        left_out = (*self.left_out, *assets.get("left_out", ()))
+        added = (*self.added, *assets.get("added", ()))
+        return replace(self, **merged, left_out=left_out, added=added)

@@ -140,6 +140,7 @@ def serve_scene(
                 "displacement": None if displacement is None else str(displacement),
                 "displacement_px": None if pyramid is None else pyramid.size,
                 "left_out": [list(row) for row in scene.left_out],
+                "added": [list(row) for row in scene.added],
             }
             console.print_line(
                 f"{served.url}: open it in a browser on this machine; Ctrl-C ends it"

@@ -71,7 +71,7 @@ def build_assets(source: SceneSource) -> Assets:
             hair.opening_mm.reshape(len(hair.opening_mm), -1), HAIR_STEPS_PER_MM
         ),
         "hair_roots": hair.roots.astype(np.uint32)[:, None],
-        "hair_coverage": np.rint(255.0 * hair.coverage).astype(np.uint8)[:, None],
+        "hair_coverage": np.rint(255.0 * hair.coverage).astype(np.uint8),
     }
     facts = {
         "lid_steps_per_mm": LID_STEPS_PER_MM,

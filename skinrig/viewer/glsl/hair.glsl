@@ -9,8 +9,8 @@ vec4 hairPlace(vec3 position, float tolerance_mm) {
   return vec4(place.xy, nearer.z / nearer.w * place.w, place.w);
 }
 //@chunk undercoat_vertex
-in float a_coverage;
-out float v_coverage;
+in vec2 a_coverage;  // of the scalp's hair, and of brows
+out vec2 v_coverage;
 void main() {
   passAttributes();
   v_coverage = a_coverage;
@@ -21,11 +21,11 @@ uniform vec3 u_to_light;
 uniform vec3 u_light_center;
 uniform vec3 u_multiple;
 uniform vec2 u_shown;
-in float v_coverage;
+in vec2 v_coverage;
 layout(location = 0) out vec4 o_hair;
 void main() {
-  bool brow = v_position.z > -55.0 && v_position.y < 55.0;
-  float covered = v_coverage * (brow ? u_shown.y : u_shown.x);
+  vec2 shown = v_coverage * u_shown;
+  float covered = max(shown.x, shown.y);
   if (covered < 0.01) discard;
   vec3 normal = normalize(v_normal);
   float direct = clamp(dot(normal, u_to_light), 0.0, 1.0);

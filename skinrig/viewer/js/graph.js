@@ -3,7 +3,7 @@
 // All scripts run in one strict function and share the object V:
 //   V.glsl[chunk]           text of GLSL pieces (`//@chunk name` in glsl/*.glsl)
 //   V.scene                 what was packed: {mesh, textures, tables, params, presets, facts,
-//                           provenance, left_out}
+//                           provenance, left_out, added}
 //   V.params                the parameters now (starts as a copy of V.scene.params over
 //                           V.defaults); flat JSON values, one level of objects (weights: {...})
 //   V.defaults              each script adds its own parameters with Object.assign

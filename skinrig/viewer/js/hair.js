@@ -22,7 +22,8 @@ V.registerFaceParts = () => {
     {group: "parts", kind: "toggle", path: ["eyes_follow"], label: "Eyes follow the camera",
       off: p => !V.lidsOpen(p), help: "Both eyes turn to the camera, up to 26° sideways."},
     {group: "parts", kind: "toggle", path: ["brows"], label: "Brows and lashes"},
-    {group: "parts", kind: "toggle", path: ["hair"], label: "Hair of the scalp"},
+    ...(V.scene.facts.face_parts.counts.scalp ? [{group: "parts", kind: "toggle", path: ["hair"],
+      label: "Hair of the scalp"}] : []),
   );
 };
 
@@ -48,7 +49,10 @@ V.start.push(() => {
     opening: table("hair_opening"), fiber: gl.createBuffer(), coverage: gl.createBuffer()};
   // faces of the undercoat, with closed and with open lids; 2/255 is not drawn
   const coverage = table("hair_coverage");
-  const isCovered = (_, i, all) => [0, 1, 2].some(k => coverage[all[i - i % 3 + k]] > 2);
+  const isCovered = (_, i, all) => [0, 1, 2].some(k => {
+    const v = all[i - i % 3 + k];
+    return Math.max(coverage[2 * v], coverage[2 * v + 1]) > 2;
+  });
   V.hair.covered = [V.scene.mesh.faces, V.openFaces].map(faces => V.uploadFaces(faces.filter(isCovered)));
   gl.bindVertexArray(null);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.fiber);
@@ -164,7 +168,7 @@ V.drawHair = (ctx, side, p, uniforms) => {
   gl.bindVertexArray(mesh.vao);
   gl.bindBuffer(gl.ARRAY_BUFFER, V.hair.coverage);
   gl.enableVertexAttribArray(V.ATTRIBUTES.a_coverage);
-  gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 1, gl.UNSIGNED_BYTE, true, 0, 0);
+  gl.vertexAttribPointer(V.ATTRIBUTES.a_coverage, 2, gl.UNSIGNED_BYTE, true, 0, 0);
   V.drawMesh(side, p, V.hair.covered[Number(V.lidsOpen(p))]);
   const made = V.hairBuffers(side, p);
   V.use(V.program(["hair_place", "hair_light", "hair_vertex"],

@@ -271,7 +271,7 @@ V.presetsInOrder = () => {
 };
 
 V.describeSource = () => {
-  const {provenance = {}, facts, left_out: leftOut = []} = V.scene;
+  const {provenance = {}, facts, left_out: leftOut = [], added = []} = V.scene;
   const title = provenance.title ?? (provenance.kind === "procedural"
     ? `Simulated head, phototype ${provenance.preset}` : (provenance.appearances ?? ["Face"]).join(", "));
   document.title = `${title} — skin viewer`;
@@ -298,6 +298,7 @@ V.describeSource = () => {
         `${(100 * facts.reflectance.rms_error).toFixed(3)} %, 95th percentile of strong values ` +
         `${(100 * facts.reflectance.strong_error).toFixed(3)} %`);
     }
+    added.forEach(([what, how]) => add(`Not measured: ${what}`, how));
     leftOut.forEach(([what, why]) => add(`Omitted: ${what}`, why));
     box.append(list);
   }});

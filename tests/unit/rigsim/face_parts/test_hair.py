@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -75,6 +77,22 @@ def test_lashes_stay_outside_of_eyeballs(mesh, drawn):
 def test_hair_covers_crown_and_no_cheek(mesh, drawn):
     height = mesh.vertices_mm[:, 1]
     front = mesh.vertices_mm[:, 2] > -45.0
-    assert drawn.coverage[height > 120.0].min() > 0.9
+    scalp, brow = drawn.coverage.T
+    assert scalp[height > 120.0].min() > 0.9
     assert drawn.coverage[front & (height < 30.0)].max() < 0.05
-    assert 0.3 < drawn.coverage[front & (np.abs(height - 42.0) < 8.0)].max() < 0.5
+    at_brow = front & (np.abs(height - 42.0) < 8.0)
+    assert 0.3 < brow[at_brow].max() < 0.5
+    assert scalp[at_brow].max() < 0.01
+    assert brow[height > 70.0].max() == 0.0
+
+
+def test_skin_below_hairline_gets_no_hair(mesh):
+    """Brows and lashes are the same as on the whole head."""
+    corners = mesh.vertices_mm[mesh.faces]
+    face = (corners[..., 1] < 62.0).all(axis=1) & (corners[..., 2] > -40.0).all(axis=1)
+    front = replace(mesh, faces=mesh.faces[face])
+    found = hair.draw_hair(front, "III", seed=2, lids=eyelids.build_eyelids(mesh))
+    assert found.counts[2] == 0
+    assert np.isfinite(found.points_mm).all()
+    whole = hair.draw_hair(mesh, "III", seed=2)
+    np.testing.assert_array_equal(found.points_mm, whole.points_mm[: sum(whole.counts[:2])])

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from fixtures.head_scans import draw_scan
+from fixtures.head_scans import draw_scan, write_obj
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.surface.errors import interior_error
+from rigsim.geometry.mesh import build_mesh
+from skinrig.cli import main
 from skinrig.fusing.double import FusionInputs, fuse, fuse_sources
 from skinrig.fusing.sources import read_sources
-from skinrig.fusing.unmeasured import UNMEASURED_NAME, add_unmeasured
+from skinrig.fusing.unmeasured import UNMEASURED_NAME, UNMEASURED_SOURCE, add_unmeasured
 from skinrig.unmeasured.person import HEAD_FILE, UNMEASURED_KEY
 
 SIDE = 12
-
-
-def _write_obj(mesh):
-    """Return the bytes of a mesh as an .obj file."""
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices_mm.tolist()]
-    lines += [f"vt {u:.9g} {v:.9g}" for u, v in mesh.uv.tolist()]
-    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
-    return "\n".join(lines).encode()
 
 
 def _draw_dome(files):
@@ -47,7 +44,7 @@ def _content(folder):
 @pytest.mark.long
 def test_option_leaves_equal_bytes_and_default_adds_file(tmp_path):
     dome = tmp_path / "dome"
-    store.write(dome, _draw_dome({"mesh.obj": _write_obj(draw_scan(303)[0])}))
+    store.write(dome, _draw_dome({"mesh.obj": write_obj(draw_scan(303)[0])}))
     given = FusionInputs((dome,))
     plain = fuse_sources(read_sources(given.paths), given)
     store.write(tmp_path / "plain", plain.appearance)
@@ -58,7 +55,52 @@ def test_option_leaves_equal_bytes_and_default_adds_file(tmp_path):
     assert set(more) - set(less) == {HEAD_FILE}
     assert {name for name in less if more[name] != less[name]} == {"appearance.json"}
     assert found.parameters[UNMEASURED_KEY]["measured"] is False
-    assert any("not measured" in text for text in found.parameters["assumed"])
+    assert sum(one.endswith(UNMEASURED_SOURCE) for one in found.parameters["assumed"]) == 1
+    assert {"eyes", "hair", "crown", "neck"} <= set(found.parameters[UNMEASURED_KEY]["parts"])
+
+
+@pytest.mark.long
+def test_turned_face_prints_reason(tmp_path, capsys):
+    """By 30 degrees about y: the eyes would look elsewhere."""
+    scan, _ = draw_scan(303)
+    c, s = np.cos(np.pi / 6.0), np.sin(np.pi / 6.0)
+    turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], np.float32)
+    turned = build_mesh(scan.vertices_mm @ turn.T, scan.faces, scan.uv)
+    store.write(tmp_path / "dome", _draw_dome({"mesh.obj": write_obj(turned)}))
+    argv = ["fuse", str(tmp_path / "dome"), "--out", str(tmp_path / "double"), "--json"]
+    assert main(argv) == 0
+    printed = capsys.readouterr()
+    assert "omitted: unmeasured parts: scan: got a face turned by 30 degrees" in printed.err
+    document = json.loads(printed.out)
+    assert "turned by 30 degrees" in dict(document["left_out"])["unmeasured parts"]
+    assert document["unmeasured"] is None
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [(b"v 1 2\nnonsense", "mesh.obj"), (b"v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3", "texture")],
+)
+def test_fusion_survives_mesh_that_is_not_usable(tmp_path, data, reason):
+    store.write(tmp_path / "dome", _draw_dome({"mesh.obj": data}))
+    found = fuse(FusionInputs((tmp_path / "dome",)), out=tmp_path / "double")
+    assert reason in dict(found.left_out)["unmeasured parts"]
+    assert HEAD_FILE not in store.read(tmp_path / "double").files
+
+
+def test_parts_of_fused_input_are_dropped(tmp_path):
+    dome = _draw_dome({HEAD_FILE: b"of another fusion"})
+    own = {UNMEASURED_KEY: {"parts": ["eyes"]}, "assumed": [f"eyes: {UNMEASURED_SOURCE}", "light"]}
+    rows = (("unmeasured parts: hair", "none"), ("color", "none"))
+    dome = replace(dome, parameters={**dome.parameters, **own}, left_out=rows)
+    store.write(tmp_path / "dome", dome)
+    given = FusionInputs((tmp_path / "dome",), without=(UNMEASURED_NAME,))
+    found = fuse(given, out=tmp_path / "double").appearance
+    assert HEAD_FILE not in found.files
+    assert UNMEASURED_KEY not in found.parameters
+    assert "dome: light" in found.parameters["assumed"]
+    assert not any("eyes" in one for one in found.parameters["assumed"])
+    assert "color" in dict(found.left_out)
+    assert "unmeasured parts: hair" not in dict(found.left_out)
 
 
 def test_appearance_without_mesh_stays_as_it_is(tmp_path):

@@ -113,6 +113,28 @@ def test_measured_colors_continue_linearly_into_patches(scan):
     assert not changed[rows, columns].any()
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_holes_of_three_and_four_vertices_are_painted(count):
+    """The corners of the rim's polygon are within the patch's circle."""
+    whole = _dome(())
+    middle = whole.vertices_mm[whole.faces].mean(axis=1)
+    first = int(np.argmin(np.linalg.norm(middle - [10.0, 14.0, 57.0], axis=1)))
+    shared = np.isin(whole.faces, whole.faces[first]).sum(axis=1) == 2
+    removed = [first, int(np.flatnonzero(shared)[0])][:count]
+    mesh = build_mesh(whole.vertices_mm, np.delete(whole.faces, removed, axis=0), whole.uv)
+    closed = patch_charts.close_holes(mesh)
+    assert [len(chart.rim_uv) for chart in closed.charts] == [2 + count]
+    size = 512
+    ramp = np.broadcast_to((np.arange(size, dtype=np.float32) / size)[:, None], (size, size))
+    painted = closed.paint(ramp)
+    assert np.isfinite(painted).all()
+    row, column = np.nonzero(painted != ramp)
+    assert len(row) > 20
+    height = 1.0 - closed.charts[0].rim_uv[:, 1]
+    assert painted[row, column].min() > height.min() - 2.0 / size
+    assert painted[row, column].max() < height.max() + 2.0 / size
+
+
 def test_texture_without_room_leaves_hole_open_and_reports(scan):
     wide = (scan.uv - scan.uv.min()) / np.ptp(scan.uv)
     full = build_mesh(scan.vertices_mm, scan.faces, wide)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from model.skin import SkinAppearance
 from skinrig.rendering.hole_patches import ClosedMesh
 from skinrig.unmeasured.head_fit import fit_head
 from skinrig.unmeasured.person import HEAD_FILE, assemble_person
+from skinrig.viewer import faces
 from skinrig.viewer.assets import face_parts
 
 pytestmark = pytest.mark.long
@@ -40,6 +42,20 @@ def test_parts_of_scan_are_labelled_not_measured(person):
         assert found["tables"][f"lid_faces_{name}"].shape == (0, 1)
         moves = found["tables"][f"lid_moves_{name}"].astype(np.float64) / 512.0
         np.testing.assert_allclose(moves[:, :3], lids.opening_mm, atol=1.0 / 512.0)
+
+
+def test_provenance_lists_parts_that_are_displayed(person):
+    """Crown without eyes, and eyes without a crown."""
+    given = SimpleNamespace(kind="dome", appearances={"dome": SkinAppearance({}, "simulated", {})})
+
+    def listed(**changes):
+        found = faces._provenance(given, [], replace(person, **changes), "mesh.obj")
+        return found.get("not_measured")
+
+    assert listed()[:6] == ["eyes", "lids", "lashes", "brows", "hair", "crown"]
+    assert listed(parts=None)[:2] == ["crown", "neck"]
+    assert listed(fractions={}) == ["eyes", "lids", "lashes", "brows", "hair"]
+    assert listed(parts=None, fractions={}) is None
 
 
 def test_scan_without_parts_has_no_eyes(person):
