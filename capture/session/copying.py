@@ -32,11 +32,9 @@ from capture.session.contents import (
 from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionDamage, SessionError, SessionLocked
 from capture.session.folder import DiskErrors, write_new
-from capture.session.journal import AttachmentLine, FrameLine
+from capture.session.journal import FileLine
 from capture.session.verification import N_READERS
 from capture.session.view import check_file
-
-FileLine = FrameLine | AttachmentLine
 
 Texts = dict[str, bytes]
 """Bytes of the manifest, of the consent's seal where there is one, and of the journal, by name."""

@@ -131,6 +131,9 @@ class AttachmentLine(Document):
         checks.close()
 
 
+FileLine = FrameLine | AttachmentLine
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OmissionLine(Document):
     """Journal line of plan steps that will not be captured."""

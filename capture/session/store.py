@@ -30,6 +30,7 @@ from capture.session.journal import (
     ATTACHMENT_RULE,
     AttachmentLine,
     CloseLine,
+    FileLine,
     FrameLine,
     NewFrame,
     OmissionLine,
@@ -294,8 +295,7 @@ class Session(SessionView):
     ) -> None:
         """Record, safe from a power cut, that steps will not be captured, and why.
 
-        The session is complete without them. Frames of these steps stay on the disk but do not
-        count: a step is used completely or not at all.
+        The session is complete without them. Their frames stay on the disk, and do not count.
 
         Parameters
         ----------
@@ -323,9 +323,8 @@ class Session(SessionView):
         checks.check("reason", reason, bool(reason.strip()), "a text")
         for step_id in step_ids:
             self.plan.step(step_id)  # names unknown steps
-            checks.check(
-                "step_ids", step_id, step_id not in self._left_out, "steps not omitted before"
-            )
+            fresh = step_id not in self._left_out
+            checks.check("step_ids", step_id, fresh, "steps not omitted before")
         checks.close()
         line = OmissionLine(
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
@@ -336,12 +335,10 @@ class Session(SessionView):
             self._head = head
             self._left_out.update(dict.fromkeys(line.steps, line))
 
-    def _write(
-        self, descriptor: int, files: Iterable[tuple[FrameLine | AttachmentLine, Blob]]
-    ) -> None:
+    def _write(self, descriptor: int, files: Iterable[tuple[FileLine, Blob]]) -> None:
         """Write files of one folder, and then their lines of the journal, to the medium."""
         text, head = b"", self._head
-        lines: list[FrameLine | AttachmentLine] = []
+        lines: list[FileLine] = []
         refused: list[BaseException] = []
 
         def seal() -> Iterator[tuple[Path, Blob]]:
@@ -358,10 +355,14 @@ class Session(SessionView):
                 self._append(descriptor, text)
             self._head = head
             for line in lines:
-                if isinstance(line, AttachmentLine):
-                    self._attached[line.name] = line
-                else:
-                    self._lines.setdefault((line.step, line.camera), []).append(line)
+                self._add_line(line)
+
+    def _add_line(self, line: FileLine) -> None:
+        """Count a file whose line is durable."""
+        if isinstance(line, AttachmentLine):
+            self._attached[line.name] = line
+        else:
+            self._lines.setdefault((line.step, line.camera), []).append(line)
 
     @contextmanager
     def _released_on_failure(self, refused: Sequence[BaseException] = ()) -> Iterator[None]:
@@ -381,8 +382,7 @@ class Session(SessionView):
         Parameters
         ----------
         missing_reason : str
-            Why steps of the plan are missing; required when steps are missing that were not
-            omitted.
+            Why steps are missing that were not omitted; required where there are any.
 
         Raises
         ------

@@ -37,8 +37,8 @@ def join_frames(frames: NDArray[np.uint8]) -> UInt8Array:
 
     Examples
     --------
-    >>> join_frames(np.zeros((5, 5, 216, 192, 3), np.uint8)).shape
-    (1080, 960, 3)
+    >>> join_frames(np.zeros((5, 5, 270, 240, 3), np.uint8)).shape
+    (1350, 1200, 3)
     """
     width, height = FRAME_PX
     expected = (N_LIGHTS, N_STEPS, height, width, 3)

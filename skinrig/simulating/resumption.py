@@ -207,6 +207,7 @@ class ReplayedSession(Session):
             text, head = seal_bounded_line(self._head, file[0])
             self._replay(text)
             self._head = head
+            self._add_line(file[0])
         super()._write(descriptor, fresh)
         for line, blob in written:
             if isinstance(line, FrameLine) or "camera" in line.about:
