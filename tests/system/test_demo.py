@@ -106,7 +106,7 @@ def test_fusion_in_process_follows_all_rigs(tmp_path, monkeypatch):
     assert {name for name, _ in parts[:2]} == {"flash", "dome"}
     assert parts[2][0] == demo.PERSON_PART
     marks = ["session-dome-white", "session-flash-white"]
-    assert parts[2][1][0].errors == [[["flash", "dome"], marks]]
+    assert parts[2][1][0].errors == [[("flash", "dome"), [["flash"], ["dome"]], marks]]
     with pytest.raises(DemoError, match="no probe"):
         list(demo._run_in_processes(["gradient", "probe"], (tmp_path,), 2))
     assert not multiprocessing.active_children()
