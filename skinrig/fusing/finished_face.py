@@ -6,7 +6,7 @@ no rig measures it in the demo. Crown and neck are those of the fitted mean head
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -62,8 +62,6 @@ FIELD_OF_VIEW_DEG: Final = 17.8
 """Of the longer side: 219 mm at the origin of the rig, from the crown to the neck."""
 MIN_NORMAL_COSINE: Final = 0.5
 """Least cosine between a drawn measured normal and that of the mesh."""
-UNDRAWN_PARTS: Final = "eyes, lids, lashes, brows and hair"
-"""Parts of `DisplayedPerson.summary` that the frames lack."""
 BACKGROUND_CODES: Final = np.array([40.0, 42.0, 45.0])
 """8-bit sRGB."""
 
@@ -127,7 +125,7 @@ def render_finished_face(
     weights = np.linspace(0.0, 1.0, N_STEPS)
     steps = [_render_step(skin.at(float(w)), mesh, np.float32(w) * moved_mm) for w in weights]
     left_out = (
-        *(row for row in whole.person.summary() if row[0] != UNDRAWN_PARTS),
+        *_list_unmeasured(whole.person),
         ("movement of this face", "no rig measures it here; the blend shapes are simulated"),
         ("fine wrinkles", "the fused maps have none"),
         ("open eyes and hair", "not drawn here, as no rig measures them"),
@@ -135,6 +133,13 @@ def render_finished_face(
     return FinishedFace(
         _develop(steps), expression, tuple(weights.tolist()), skin.known_fraction, seed, left_out
     )
+
+
+def _list_unmeasured(person: DisplayedPerson | ClosedMesh) -> Iterator[tuple[str, str]]:
+    """Yield what was not measured, except for eyes and hair, which are not drawn."""
+    parts = person.parts if isinstance(person, DisplayedPerson) else None
+    undrawn = None if parts is None else ", ".join(parts.names)
+    yield from (row for row in (*person.added(), *person.omitted()) if row[0] != undrawn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
