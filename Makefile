@@ -9,17 +9,16 @@ WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max
 # make full RIG=flash: a rig at the size of its paper
 RIG := dome
 
-# make test-long PART=2/3, make test-all PART=2/3: the second of three parts, each for a machine of its own
+# make test-long PART=2/3: the second of three parts, each for a machine of its own
 PART := 1/1
 
-.PHONY: help setup browser firmware demo full test test-long test-all lint docs bench clean
+.PHONY: help setup browser firmware demo full test test-long lint docs bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, fuse, report (leaves ./demo)"
 	@echo "make full       one rig at the size of its paper, in ./full-RIG (RIG=dome, flash, gradient or probe; hours)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones (PART=2/3: the second of three parts)"
-	@echo "make test-all   both in one run, as CI does"
 	@echo "make lint       ruff, mypy and the import contracts"
 	@echo "make docs       the documentation site, into ./site (open site/index.html)"
 	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
@@ -58,9 +57,6 @@ test: .venv/.ready
 
 test-long: .venv/.ready
 	@$(PYTEST) -q $(WORKERS) --durations 25 -m long --part $(PART) tests
-
-test-all: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) --durations 25 --part $(PART)
 
 # the variable silences a note of mkdocs-material on its successor
 docs: .venv/.ready
