@@ -6,8 +6,8 @@
 RUN is a run of `tools/measure_scales.py`, whose calibration and sessions the step reads. The step's
 own command runs at a moderate size, on one thread. Each call of a kernel adds its processor time;
 the largest call's arguments are kept. Then rates of the machine and that call are measured in turns
-in the same minute. Costs of each kernel are in `tools/kernel_costs.py`. The rate of rays is not a
-limit of the machine, so kernels that trace rays have none.
+in the same minute. Kernels are in `tools/listed_kernels.py`, costs in `tools/kernel_costs.py`. The
+rate of rays is not a limit of the machine, so kernels that trace rays have none.
 """
 
 import argparse
@@ -30,7 +30,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kernel_costs import KERNELS, STEPS, Cost, Kernel
+from kernel_costs import Cost
+from listed_kernels import KERNELS, STEPS, Kernel
 from numba import njit
 
 ONE_THREAD = {

@@ -334,8 +334,8 @@ def test_step_runs_and_puts_its_kernels_back(costs, tool, monkeypatch):
     assert all(line.count("|") == 6 for line in lines if "expose_sensor" in line)
 
 
-def test_every_kernel_exists_and_takes_its_step(costs, tool):
-    for kernel in costs.KERNELS:
+def test_every_kernel_exists_and_takes_its_step(tool):
+    for kernel in tool.KERNELS:
         owner = tool.importlib.import_module(kernel.module)
         for name in kernel.name.split("."):
             owner = getattr(owner, name)
@@ -348,6 +348,6 @@ def test_every_kernel_exists_and_takes_its_step(costs, tool):
         inspect.signature(kernel.prepare).bind(*given)
         for function in (kernel.count, kernel.cost or kernel.count):
             inspect.signature(function).bind(*given, **options)
-        assert set(kernel.steps) <= set(costs.STEPS), kernel.name
+        assert set(kernel.steps) <= set(tool.STEPS), kernel.name
     with pytest.raises(SystemExit, match="reads a run's sessions"):
         tool.measure("dome", "reconstruct", None)

@@ -166,7 +166,7 @@ def test_frames_of_other_light_levels_show_same_motion():
     ("made", "why"),
     [
         ({"times_s": ()}, "no tracking frame"),
-        ({"times_s": (3.0,)}, "one tells no motion"),
+        ({"times_s": (3.0,)}, "one shows no motion"),
         ({"times_s": (0.0, 20.0), "lacks": (1, RIG.views[0].name)}, "one of two lacks a camera"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
