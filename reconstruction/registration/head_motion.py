@@ -17,6 +17,11 @@ from model.checks import Checks
 from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason, estimate_condition
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
+from reconstruction.registration.rigid_frames import (
+    RAYLEIGH_MEDIAN,
+    find_rigid_frames,
+    residual_scales,
+)
 
 _log = logging.getLogger(__name__)
 NO_STEPS = SolverOutcome(0, 0.0, UNKNOWN_CONDITION, "tolerance")
@@ -26,17 +31,6 @@ MIN_TRACK_COSINE = 0.4
 MIN_TRACKS = 12
 """Fewest tracks from which a frame's motion is estimated."""
 TRACK_TUKEY_SIGMAS = 4.685
-TRACK_OUTLIER_SIGMAS, TRACK_OUTLIER_PX = 4.0, 0.3
-"""Residual, in the capture's median scale and in px, above which a track is nonrigid."""
-MAX_EXCESS_NONRIGID_FRACTION = 0.05
-"""Excess of a frame's fraction of nonrigid tracks above the median that makes it unusable."""
-MAX_NONRIGID_FRACTION = 0.3
-MAX_NONRIGID_FRAME_FRACTION = 1 / 3
-"""Fraction of frames above which a track that is nonrigid is not on the skin."""
-FACE_PART_MM = 15.0
-MAX_PART_RESIDUAL_RATIO = 2.5
-"""Residual of the worst part of a face over the capture's median one, and over the median relative
-to the frame's own residuals: an expression exceeds both."""
 BLOCK_PX = 32
 """Side of the parts of an image within which errors of tracks are correlated."""
 SMALL_MOVE = np.repeat([1e-8, 1e-6], 3)
@@ -44,8 +38,6 @@ SMALL_MOVE = np.repeat([1e-8, 1e-6], 3)
 MAX_LAST_MOVE_SIGMAS = 0.1
 """Last step, in standard errors, from which a usable frame's motion is reported as unfinished."""
 _DIFFERENCE_MM = 0.01
-_MIN_RESIDUAL_PX = 1e-6
-_RAYLEIGH_MEDIAN = 1.1774100225154747  # median length of a unit normal vector in two dimensions
 
 
 class HeadMotionError(ValueError):
@@ -170,6 +162,7 @@ def estimate(
     normals: ArrayLike,
     times_s: ArrayLike,
     *,
+    light: ArrayLike = 1.0,
     reference: int = 0,
     tracks_per_camera: int = 300,
     iterations: int = 12,
@@ -187,6 +180,9 @@ def estimate(
         thousands suffice.
     times_s : array_like, shape (T,)
         Of the frames, increasing, s.
+    light : array_like, shape (T,) or ()
+        Of the frames, positive, any unit. Darker frames lose more tracks to noise, so that frames
+        of like light are compared.
     reference : int
         Frame in which the head has the scan's pose.
     tracks_per_camera : int
@@ -209,6 +205,8 @@ def estimate(
     the noise of the reference frame, are not included.
     """
     points, outward, times = _checked(frames, cameras, points_mm, normals, times_s, reference)
+    lights = np.broadcast_to(np.asarray(light, np.float64), times.shape)
+    Checks(HeadMotionError).within("light", lights, "(0, inf)")
     chosen, evened = [], []
     for number, camera in enumerate(cameras):
         even = registration.normalize_local_contrast(np.asarray(frames[reference][number]))
@@ -229,8 +227,19 @@ def estimate(
             found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
-    motion = _evaluate_frames(
-        found, np.concatenate([points[rows] for rows in chosen]), times, reference
+    left = np.array([pose.residual_px for pose in found])
+    stderr = np.array([pose.stderr for pose in found])
+    tracked = np.concatenate([points[rows] for rows in chosen])
+    determined = np.isfinite(stderr).all(axis=1)
+    moved = np.array([pose.motion for pose in found])
+    motion = HeadMotion(
+        times_s=times,
+        rotation_rad=moved[:, :3],
+        translation_mm=moved[:, 3:],
+        stderr=stderr,
+        usable=find_rigid_frames(left, tracked, determined, lights, reference),
+        residual_px=residual_scales(left),
+        tracks=np.count_nonzero(np.isfinite(left), axis=1),
     )
     used = [pose.outcome for pose, usable in zip(found, motion.usable, strict=True) if usable]
     max(used, key=lambda one: one.residual).warn_unless_converged("head motion", _log)
@@ -306,7 +315,7 @@ def _pose(
     for step in range(iterations + 1):
         r, J = _residuals(seen, motion)
         length = np.linalg.norm(r, axis=1)
-        scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
+        scale = max(float(np.median(length)) / RAYLEIGH_MEDIAN, 1e-6)
         u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
         if (np.abs(move) < SMALL_MOVE).all() or step == iterations:
             break
@@ -323,18 +332,6 @@ def _pose(
     left[found] = length
     stop: StopReason = "tolerance" if residual < MAX_LAST_MOVE_SIGMAS else "limit"
     return _Pose(motion, stderr, left, SolverOutcome(step, residual, condition, stop))
-
-
-def _worst_part(points: Float64Array, length: Float64Array) -> float:
-    """Return the largest median residual of parts that overlap by half; 0 without three tracks."""
-    worst = 0.0
-    for shift in (0.0, 0.5):
-        cell = np.floor(points / FACE_PART_MM + shift).astype(np.intp)
-        _, part, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-        part = part.reshape(-1)
-        for number in np.flatnonzero(count >= 3):
-            worst = max(worst, float(np.median(length[part == number])))
-    return worst
 
 
 def _blocks(seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]]) -> NDArray[np.intp]:
@@ -404,47 +401,3 @@ def _residuals(
     known = np.isfinite(r).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
     # a point that a step moved behind its camera has no gradient
     return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
-
-
-def _evaluate_frames(
-    found: Sequence[_Pose], points: Float64Array, times: Float64Array, reference: int
-) -> HeadMotion:
-    """Mark usable frames by comparison: typical residuals are noise, larger ones an expression."""
-    left = np.array([f.residual_px for f in found])
-    known = np.isfinite(left)
-    scales = np.array([_middle(row) / _RAYLEIGH_MEDIAN for row in left])
-    determined = np.array([np.isfinite(f.stderr).all() for f in found])
-    others = determined & (np.arange(len(found)) != reference)
-    far = left > max(TRACK_OUTLIER_SIGMAS * _middle(scales[others]), TRACK_OUTLIER_PX)
-    # a track that is nonrigid in many frames is at an occluding edge, not in an expression
-    steady = np.ones(len(points), bool)
-    if np.count_nonzero(others) >= 4:
-        steady = np.mean(far[others], axis=0) <= MAX_NONRIGID_FRAME_FRACTION
-    share = np.mean(far[:, steady], axis=1) if steady.any() else np.ones(len(found))
-    worst = np.array(
-        [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
-    )
-    usable = determined & (
-        share <= min(_middle(share[others]) + MAX_EXCESS_NONRIGID_FRACTION, MAX_NONRIGID_FRACTION)
-    )
-    # residuals grow as the head turns under the lights, also those of the worst part
-    own = worst / np.maximum(scales, _MIN_RESIDUAL_PX)
-    usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
-    usable &= worst <= np.fmax(MAX_PART_RESIDUAL_RATIO * usual, TRACK_OUTLIER_PX)
-    usable[reference] = True
-    motion = np.array([f.motion for f in found])
-    return HeadMotion(
-        times_s=times,
-        rotation_rad=motion[:, :3],
-        translation_mm=motion[:, 3:],
-        stderr=np.array([f.stderr for f in found]),
-        usable=usable,
-        residual_px=scales,
-        tracks=np.count_nonzero(known, axis=1),
-    )
-
-
-def _middle(values: Float64Array) -> float:
-    """Return the median of the finite values, 0 without any."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else 0.0

@@ -103,6 +103,7 @@ def follow_head(
     times = np.array([_time_s(shots[images.views[0]]) for shots in whole])
     order = np.argsort(times)
     frames = [[_gray(session, whole[k][view]) for view in images.views] for k in order]
+    light = [_light(whole[k][images.views[0]]) for k in order]
     step = max(1, len(surface.points_mm) // TRACKED_POINTS)
     points = surface.points_mm[::step].astype(np.float64)
     found = head_motion.estimate(
@@ -111,6 +112,7 @@ def follow_head(
         points,
         surface.normals[::step].astype(np.float64),
         times[order],
+        light=light,
         reference=len(order) // 2,
     )
     when = np.array([np.mean(images.times_s(images.views[0], *key)) for key in images.captures])
@@ -148,6 +150,11 @@ def _time_s(record: Any) -> float:
 def _gray(session: Session, record: Any) -> Float32Array:
     """Return a tracking frame over its light, as levels and exposures differ between frames."""
     frame = session.read(record)
-    light = float(record.settings.get("level", 1.0)) * float(frame.exposure_s or 1.0)
     image = raw.linear_rgb(frame, demosaic="centered")
-    return np.asarray(image.rgb.mean(axis=-1) / max(light, 1e-9), np.float32)
+    return np.asarray(image.rgb.mean(axis=-1) / _light(record), np.float32)
+
+
+def _light(record: Any) -> float:
+    """Return the level of the LEDs times the exposure time."""
+    level, exposure_s = (float(record.settings.get(key) or 1.0) for key in ("level", "exposure_s"))
+    return max(level * exposure_s, 1e-9)

@@ -170,6 +170,24 @@ def test_twitch_is_not_head_motion_and_frame_unusable(rng, caplog):
     )
 
 
+def test_dark_frames_are_compared_with_dark_frames():
+    rng = np.random.default_rng(1)
+    motions = drift(rng, 12, 1.0, 0.3)
+    dark, twitch = np.arange(12) >= 7, np.where(np.arange(12) == 9, 4.0, 0.0)
+    frames = [
+        capture(rng, [motion], [slide], noise=0.2 if noisy else 0.003)[0]
+        for motion, slide, noisy in zip(motions, twitch, dark, strict=True)
+    ]
+    points, normals = ball_points()
+    given = (frames, CAMERAS, points, normals, np.arange(12.0))
+    found = head_motion.estimate(*given, light=np.where(dark, 1.0, 100.0))
+    assert np.flatnonzero(~found.usable).tolist() == [9]
+    # with one light for all, noise passes for an expression
+    assert np.flatnonzero(~head_motion.estimate(*given).usable).tolist() == [7, 8, 9, 10, 11]
+    with pytest.raises(HeadMotionError, match="light"):
+        head_motion.estimate(*given, light=0.0)
+
+
 def test_matrices_take_points_to_where_they_were():
     motion = head_motion.HeadMotion(
         times_s=np.array([0.0, 1.0]),
