@@ -158,7 +158,8 @@ def kernel_parts(
     a = np.where(a > 0.0, a, 1.0)
     edge, missing = profile(a, media), _missing_fraction(a, media)
     # bump of integral 1: 3 / (pi a^2) (1 - r^2 / a^2)^2 on the disc of radius a, smooth at its edge
-    shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
+    part = np.where(inside, r, 0.0) / a  # outside, its fourth power may overflow
+    shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - part**2) ** 2, 0.0)
     own = _missing_fraction(SELF_RADIUS_FRACTION * a, media)
     far = np.where(inside, edge, profile(r, media))
     return np.asarray(far + shape * (missing - own)), np.asarray(shape * own)

@@ -16,7 +16,7 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.gradient_normals import lobe_response, sphere_lights
 from reconstruction.normal_integration import relief_errors
 
-CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
+CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 FEW = settings(CHEAP, max_examples=10)
 
 SHARE = st.floats(0.0, 1.0)

@@ -14,7 +14,7 @@ from model.photon_table import medium as photon_medium
 from model.photon_table import table as photon_table
 from model.tissue_optics import adding_doubling, discrete_ordinates, layered_diffusion
 
-CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
+CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 FEW = settings(CHEAP, max_examples=10)
 
 ETA = st.floats(1.0, 1.6)

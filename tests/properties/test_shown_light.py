@@ -8,7 +8,7 @@ from twins import facial_specular, screen_scattering, tone_mapping
 
 from model import color_table
 
-CHEAP = settings(derandomize=True, deadline=None, max_examples=60, database=None)
+CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 FEW = settings(CHEAP, max_examples=15)
 
 SHARE = st.floats(0.0, 1.0)

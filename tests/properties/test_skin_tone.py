@@ -9,7 +9,7 @@ from model import skin_tone, spectra
 from model.tissue_optics import discrete_ordinates
 from model.tissue_optics.constants import PAPER_CONSTANTS, SKIN_CONSTANTS, with_fractions
 
-CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
+CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 FEW = settings(CHEAP, max_examples=8)
 
 REFLECTANCE = st.floats(1e-4, 1.0)
