@@ -111,8 +111,10 @@ def test_melanin_common_to_states_has_less_noise(fitted, folder, tmp_path):
     assert 0.35 < ratio < 0.7
 
 
-def test_a_face_without_any_expression_is_refused(folder, tmp_path):
-    simulate_session("flash", tmp_path / "session-one", subject="II", width_px=128, seed=4)
+def test_a_face_without_any_expression_is_refused(tmp_path):
+    plain = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
+    made = {"subject": "II", "width_px": 128, "seed": 4, "leave_out": plain}
+    simulate_session("flash", tmp_path / "session-one", **made)
     with pytest.raises(ValueError, match="neutral state alone"):
         fit_facial_color([tmp_path / "session-one"], out=tmp_path / "moving")
     assert not (tmp_path / "moving").exists()

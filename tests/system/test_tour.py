@@ -40,11 +40,11 @@ def simulated(tmp_path_factory):
 def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # smaller than their defaults, which other tests cover
-    monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 256)
+    monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 160)
     monkeypatch.setitem(dome.WIDTHS_PX, "small", 200)
     monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 21)
     monkeypatch.setitem(dome.VIEW_COUNTS, "small", 5)
-    monkeypatch.setattr(faces, "FACE_PX", 256)
+    monkeypatch.setattr(faces, "FACE_PX", 128)
     lines = commands(page)
     assert lines
     for words in lines:
