@@ -105,7 +105,10 @@ Hypothesis measures each."""
 @hypothesis.settings(max_examples=1)
 @hypothesis.given(hypothesis.strategies.none())
 def draw_once(nothing):
-    """Have Hypothesis register its generator: it asks the collector who refers to that."""
+    """Have Hypothesis register its generator: it asks the collector who refers to that.
+
+    Before tests are read there are few objects to ask.
+    """
 
 
 def pytest_xdist_auto_num_workers():
@@ -173,6 +176,15 @@ def pytest_ignore_collect(collection_path, config):
     return None if any(map(says_long, (collection_path, *beside, *above))) else True
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_pycollect_makeitem(collector, name, obj):
+    """Make no items of a function that is long by its own mark where these are not asked for."""
+    if name.startswith("test") and collector.config.getoption("markexpr") == "not long":
+        if any(mark.name == "long" for mark in getattr(obj, "pytestmark", ())):
+            return []
+    return None
+
+
 def recorded_durations_s():
     """Return the seconds by file of `DURATIONS`."""
     with DURATIONS.open(newline="", encoding="utf-8") as file:
@@ -186,12 +198,12 @@ def expect_durations_s(items):
 
 
 def pytest_collection():
+    draw_once()
     gc.disable()  # nothing that is read now goes away
 
 
 def pytest_collection_finish():
     """Spare the collector modules and tests, through which it went for a tenth of all time."""
-    draw_once()
     gc.enable()
     gc.freeze()
     gc.set_threshold(COLLECTOR_THRESHOLD)

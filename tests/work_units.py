@@ -13,7 +13,13 @@ NOTABLE_S = 0.02
 
 
 ARCHITECTURE = "tests/architecture"
-OF_ARCHITECTURE = frozenset({"tests/properties/test_every_function_has_one.py"})
+OF_ARCHITECTURE = frozenset(
+    {
+        "tests/properties/test_every_function_has_one.py",
+        "tests/system/test_compiled_kernels.py",
+        "tests/system/test_docs.py",
+    }
+)
 """Files elsewhere that read the syntax trees of the whole product."""
 
 

@@ -186,14 +186,6 @@ def test_packages_load_without_the_application():
     assert run.returncode == 0, run.stderr[-2000:]
 
 
-@pytest.mark.parametrize("module", ["capture", "capture.session", "capture.devices.flash"])
-def test_capture_loads_neither_renderer_nor_vision_nor_simulator(module):
-    heavy = ("mitsuba", "cv2", "matplotlib", "rigsim", "skimage", "numba")
-    code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert run.stdout.strip() == "[]", run.stdout + run.stderr
-
-
 def test_capture_has_no_branch_for_simulation():
     found = [
         f"{p.relative_to(ROOT)}:{node.lineno}"

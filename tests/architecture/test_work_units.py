@@ -18,7 +18,7 @@ def work_units(request):
     ("file", "unit"),
     [
         ("tests/architecture/test_sizes.py", "tests/architecture"),
-        ("tests/properties/test_every_function_has_one.py", "tests/architecture"),
+        ("tests/system/test_docs.py", "tests/architecture"),
         ("tests/unit/rigsim/scenes/gradient/test_scene.py", "tests/unit/rigsim/scenes"),
         ("tests/unit/rigsim/test_sensor.py", "tests/unit/rigsim/test_sensor.py"),
         ("tests/recovery/test_dome_rig.py", "tests/recovery/test_dome_rig.py"),

@@ -165,6 +165,7 @@ def test_public_functions_are_driven_over_domain_or_exempt():
     assert unjudged(public_functions(), driven() | named_by_tests()) == []
 
 
+@pytest.mark.long
 def test_function_without_test_is_found():
     lonely = "model.fresnel.nobody_calls_it"
     assert unjudged({lonely}, driven() | named_by_tests()) == [lonely]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fixtures.product_code import tree_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,8 +25,8 @@ def test_most_listed_kernels_match_code_and_argument_count(tool):
     fit = 0
     for module, name, signature in rows:
         path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
-        tree = ast.parse(path.read_text("utf-8")) if path.is_file() else ast.Module([], [])
-        found = [d for d in tree.body if isinstance(d, ast.FunctionDef) and d.name == name]
+        body = tree_of(path).body if path.is_file() else []
+        found = [d for d in body if isinstance(d, ast.FunctionDef) and d.name == name]
         given = eval(signature, {"__builtins__": {}}, tool._NAMES)
         # a function that makes kernels stands with a type of numbers, a kernel with its arguments'
         count = len(given) if isinstance(given, tuple) else 1

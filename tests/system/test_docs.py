@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from fixtures.product_code import PACKAGES, modules, text_of, tree_of
+from fixtures.product_code import PACKAGES, modules, nodes_of, text_of, tree_of
 
 from capture.devices import wire
 from capture.plan.rig_kinds import RIG_KINDS
@@ -390,12 +390,11 @@ def source_texts():
     """Every text in the source, with whatever is filled in left as a gap."""
     texts = []
     for path in modules(*PACKAGES):
-        for node in ast.walk(tree_of(path)):
-            if isinstance(node, ast.JoinedStr):
-                parts = (v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
-                texts.append("".join(map(str, parts)))
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                texts.append(node.value)
+        for node in nodes_of(tree_of(path), ast.JoinedStr):
+            parts = (v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
+            texts.append("".join(map(str, parts)))
+        strings = nodes_of(tree_of(path), ast.Constant)
+        texts += [node.value for node in strings if isinstance(node.value, str)]
     return texts + [path.read_text("utf-8") for path in sorted((ROOT / "tools").glob("*.sh"))]
 
 
@@ -423,6 +422,11 @@ def troubleshooting_rows():
     return rows
 
 
+@cache
+def read_texts():
+    return error_codes.read_error_texts(ROOT, PACKAGES)
+
+
 def code_faults(texts, listed):
     """Faults of coded messages, and of the codes that the page lists."""
     templates, codes = {}, {}
@@ -438,13 +442,13 @@ def code_faults(texts, listed):
 
 
 def test_error_codes_match_the_troubleshooting_page():
-    texts = error_codes.read_error_texts(ROOT, PACKAGES)
+    texts = read_texts()
     assert len({text.code for text in texts}) >= 50
     assert code_faults(texts, [code for code, _ in troubleshooting_rows() if code]) == []
 
 
 def test_every_code_in_source_ends_a_message():
-    found = Counter((t.path, t.code) for t in error_codes.read_error_texts(ROOT, PACKAGES))
+    found = Counter((text.path, text.code) for text in read_texts())
     written = Counter(
         (path.relative_to(ROOT).as_posix(), code)
         for path in modules(*PACKAGES)

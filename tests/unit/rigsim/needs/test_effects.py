@@ -178,6 +178,15 @@ def flash():
     return load_rig("flash").resized(64)
 
 
+@pytest.fixture(scope="module")
+def dome():
+    """One camera and ten lights on all sides."""
+    rig = load_rig("dome").resized(64)
+    return rig.subset(
+        views=["C02"], lights=[light.name for light in rig.lights[:: len(rig.lights) // 10]]
+    )
+
+
 def test_pale_skin_needs_effects_negligible_on_black(flash, faces):
     pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "black"))
     assert pale.builds(face_needs.SPECTRAL_EFFECT)
@@ -289,16 +298,14 @@ def test_more_sensitive_of_two_cameras_decides(flash, faces):
         )
 
 
-def test_flat_targets_need_neither_shadows_nor_bounces(flash):
-    dome = load_rig("dome").resized(64).subset(views=["C02"])
+def test_flat_targets_need_neither_shadows_nor_bounces(flash, dome):
     for scene in (FlashScene(flash, make_target("chart")), DomeScene(dome, make_target("white"))):
         assert scene.needs[face_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
         assert scene.needs[face_needs.LATERAL_EFFECT].verdict == "absent"
 
 
-def test_polarizers_alone_require_polarization(flash, faces):
+def test_polarizers_alone_require_polarization(flash, dome, faces):
     assert FlashScene(flash, faces["II"]).needs.builds(face_needs.POLARIZATION_EFFECT)
-    dome = load_rig("dome").resized(64).subset(views=["C02"])
     assert DomeScene(dome, faces["II"]).needs[face_needs.POLARIZATION_EFFECT].verdict == "absent"
 
 

@@ -40,6 +40,15 @@ def flash():
 
 
 @pytest.fixture(scope="module")
+def dome():
+    """One camera and ten lights on all sides."""
+    rig = load_rig("dome").resized(48)
+    return rig.subset(
+        views=["C02"], lights=[light.name for light in rig.lights[:: len(rig.lights) // 10]]
+    )
+
+
+@pytest.fixture(scope="module")
 def face():
     return make_subject("III", seed=0, size=64)
 
@@ -88,13 +97,12 @@ def test_tissue_size_bounds_change_of_face(rule, flash, face):
     assert scenes[1].needs[rule.name].verdict == "asked"
 
 
-def test_negligible_tissue_makes_scene_use_typical_table(flash, face):
+def test_negligible_tissue_makes_scene_use_typical_table(flash, dome, face):
     small, large = (dataclasses.replace(face, tissue=nearly_typical(s)) for s in (1e-3, 1.0))
     scene = FlashScene(flash, small)
     assert {scene.needs[name].verdict for name in PROPERTIES} == {"negligible"}
     assert scene.subject.tissue == TYPICAL_SKIN
     assert FlashScene(flash, large).subject.tissue == PERSON
-    dome = load_rig("dome").resized(48).subset(views=["C02"])
     assert DomeScene(dome, small).subject.tissue == TYPICAL_SKIN
     assert DomeScene(dome, large).subject.tissue == PERSON
 

@@ -54,9 +54,10 @@ def test_more_people_than_were_captured_are_refused(people, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_labels_without_faces_are_refused(lab, capsys):
-    folder, _, labels = lab
-    argv = ["analyse", "albedo", "--labels", str(labels), "--out", str(folder / "none")]
+def test_labels_without_faces_are_refused(tmp_path, capsys):
+    labels = tmp_path / "labels.csv"
+    labels.write_text("name,tan\nface,1\n")
+    argv = ["analyse", "albedo", "--labels", str(labels), "--out", str(tmp_path / "none")]
     assert main(argv) == 2
     assert "name APPEARANCE/ folders" in capsys.readouterr().err
 

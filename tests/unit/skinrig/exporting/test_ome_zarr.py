@@ -3,6 +3,7 @@
 import json
 import time
 from datetime import date
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,8 +15,7 @@ from skinrig import consent
 from skinrig.exporting.export import export
 from skinrig.exporting.options import ExportError, ExportSettings
 
-pytest.importorskip("zarr")
-Blosc = pytest.importorskip("numcodecs").Blosc
+pytestmark = pytest.mark.skipif(find_spec("zarr") is None, reason="no zarr")
 
 
 @pytest.fixture
@@ -31,6 +31,8 @@ def maps():
 
 def read_image(folder):
     """Return array and axes of an image from the files alone, by the two specifications."""
+    from numcodecs import Blosc
+
     ome = json.loads((folder / "zarr.json").read_text())["attributes"]["ome"]
     (scale,) = ome["multiscales"]
     (dataset,) = scale["datasets"]

@@ -96,9 +96,14 @@ def both(folders, **more):
     )
 
 
+@pytest.fixture(scope="module")
+def fused(folders):
+    return fuse(both(folders), out=folders / "fused")
+
+
 @pytest.mark.long
-def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
-    found = fuse(both(folders), out=tmp_path / "double").appearance
+def test_fuse_two_rigs_lowers_r_d_error(folders, fused):
+    found = fused.appearance
     true = REFLECTANCE * np.exp(LOG_R_D_OVER_REFLECTANCE)
     good = found.maps["r_d"].mask
     assert good.mean() > 0.5
@@ -111,33 +116,29 @@ def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
 
 
 @pytest.mark.long
-def test_fuse_writes_common_and_own_errors(folders, tmp_path):
-    fuse(both(folders), out=tmp_path / "double")
-    maps = store.read(tmp_path / "double").maps
+def test_fuse_writes_common_and_own_errors(folders, fused):
+    maps = store.read(folders / "fused").maps
     good = maps["melanin"].mask
     own = maps["melanin_texel_stderr"].values[good]
     assert (maps["melanin"].stderr[good] > own).all()
     assert np.isfinite(maps["melanin_blood_covariance"].values[good]).all()
 
 
-def test_fuse_without_albedo_keeps_mesh(folders, tmp_path):
+def test_fuse_without_albedo_keeps_mesh(folders, fused, tmp_path):
     found = fuse(both(folders, without=("r_d",)), out=tmp_path / "double").appearance
     assert "r_d" not in found.maps
     assert found.maps["melanin"].values.shape == (SIDE, SIDE)
-    whole = fuse(both(folders), out=tmp_path / "whole").appearance
-    rows = {row[0]: row for row in compare_without(whole, found)}
+    rows = {row[0]: row for row in compare_without(fused.appearance, found)}
     _, full, less, change = rows["melanin"]
     assert less > full
     assert change > 0.0
     assert rows["r_d red"][2] is None
 
 
-def test_fuse_without_covariance_is_less_exact(folders, tmp_path):
-    maps = [
-        fuse(both(folders, without=left), out=tmp_path / f"double{len(left)}").appearance.maps
-        for left in ((), ("covariance",))
-    ]
-    width = [float(np.median(one["melanin"].stderr[one["melanin"].mask])) for one in maps]
+def test_fuse_without_covariance_is_less_exact(folders, fused, tmp_path):
+    without = fuse(both(folders, without=("covariance",)), out=tmp_path / "double")
+    maps = [one.appearance.maps["melanin"] for one in (fused, without)]
+    width = [float(np.median(one.stderr[one.mask])) for one in maps]
     assert width[1] > width[0]
 
 
@@ -192,7 +193,7 @@ def test_fuse_flash_alone_uses_its_image(folders, tmp_path):
     assert "r_d" not in found.appearance.maps
 
 
-def test_fuse_faulty_dome_is_named(folders, tmp_path):
+def test_fuse_faulty_dome_is_named(folders, fused, tmp_path):
     write_dome(tmp_path / "dome", gain=(1.3, 1.0, 0.8))
     given = both(folders)
     wrong = FusionInputs(
@@ -200,7 +201,7 @@ def test_fuse_faulty_dome_is_named(folders, tmp_path):
         landmarks=given.landmarks,
         image_landmarks=given.image_landmarks,
     )
-    assert fuse(given, out=tmp_path / "good").contradiction is None
+    assert fused.contradiction is None
     found = fuse(wrong, out=tmp_path / "double").contradiction
     assert found is not None
     assert found.startswith("dome: R_d")

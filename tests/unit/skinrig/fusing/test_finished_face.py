@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures.finished_faces import HEAD_BLOOD, HEAD_MELANIN, HEAD_PX, matte_head
+from fixtures.finished_faces import HEAD_BLOOD, HEAD_MELANIN, HEAD_PX, matte_head, matte_maps
 from fixtures.head_scans import draw_scan
 
 from model import color_table, spectra, store
@@ -206,7 +206,7 @@ def test_unmeasured_texels_have_normals_of_the_mesh(head):
 @pytest.mark.long
 def test_crown_and_neck_continue_the_scan():
     scan, _ = draw_scan(300)
-    appearance, _ = matte_head(scan)
+    appearance, _ = matte_maps(scan)
     files = {**appearance.files, HEAD_FILE: fit_head(scan).to_bytes()}
     model = assemble(appearance)
     whole = complete_skin(dataclasses.replace(appearance, files=files), model, seed=0)

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from inspect import signature
 
 import numpy as np
@@ -17,12 +18,16 @@ from skinrig.python_api.functions import FIT_KINDS
 from skinrig.python_api.progress import show_progress
 from skinrig.reporting.folders import ReportError
 
-xarray = pytest.importorskip("xarray")
-pytest.importorskip("tqdm")
+# imported by the tests: all processes read this file
+pytestmark = pytest.mark.skipif(
+    not all(map(find_spec, ("xarray", "tqdm"))), reason="no xarray or tqdm"
+)
 
 
 def render_dome(lights=9, size=24, seed=3):
     """Return images of a matte hemisphere under distant lights, and its normals."""
+    import xarray
+
     random = np.random.default_rng(seed)
     y, x = np.mgrid[1 : -1 : size * 1j, -1 : 1 : size * 1j]
     inside = x**2 + y**2 < 0.8

@@ -168,7 +168,7 @@ def test_flat_is_uniform_unpolarized_and_cap_is_dark(rig):
 
 
 def test_chart_is_found_at_its_position(rig):
-    scene = scene_of(rig.resized(504), make_target("chart"), subpixels=2)
+    scene = scene_of(rig.resized(504), make_target("chart"))
     view = scene.rig.views[0]
     found = find_chart(scene.radiance("crossed") / scene.white_rgb())
     scale = view.focal_px / view.distance_mm
