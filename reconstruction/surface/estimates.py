@@ -36,10 +36,12 @@ HIGHLIGHT_HALF_ANGLE_RAD: Final = np.radians(35.0)
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % are below this."""
 PEAK_HALF_ANGLE_RAD: Final = np.radians(25.0)
 """The same after fitted lobes are subtracted: only their peaks are omitted."""
-LOBE_SCALE_ERROR_RATIO: Final = 3.8
-"""Ratio of the standard error of the lobes' scale to that of independent samples. Errors of one
-point's samples are correlated: by the lobes' shape, the normal and the subtracted subsurface
-scattering. On simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
+LOBE_SCALE_ERROR_RATIO: Final = 0.65
+"""Ratio of the standard error of the lobes' scale to that of one independent sample per view.
+
+All lights of a view see a point in the same pixel: its position, its normals and the subtracted
+subsurface scattering err in common. More lights therefore do not lower the error, more views do.
+docs/validation/light-dome.md has the faces that set the ratio."""
 LOBE_TILT_RAD: Final = np.radians(0.3)
 """Standard error, in each direction, of normals by highlights, from the error of the lobes."""
 
@@ -81,14 +83,16 @@ class PointValues:
 
 def has_enough_samples(samples: Lumitexels) -> BoolArray:
     """Return which points have samples of enough lights and views, shape (P,)."""
+    lights, views = (_count_kinds(samples.valid, of) for of in (samples.light, samples.view))
+    return np.asarray((lights >= MIN_LIGHTS) & (views >= MIN_VIEWS))
 
-    def kinds(index: NDArray[np.integer]) -> NDArray[np.intp]:
-        hit = np.zeros((len(samples.valid), int(index.max(initial=-1)) + 1), bool)
-        for k in range(hit.shape[1]):
-            hit[:, k] = samples.valid[:, index == k].any(axis=1)
-        return np.count_nonzero(hit, axis=1)
 
-    return np.asarray((kinds(samples.light) >= MIN_LIGHTS) & (kinds(samples.view) >= MIN_VIEWS))
+def _count_kinds(valid: BoolArray, index: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Return the number of different lights or views among the valid samples, (P,)."""
+    hit = np.zeros((len(valid), int(index.max(initial=-1)) + 1), bool)
+    for k in range(hit.shape[1]):
+        hit[:, k] = valid[:, index == k].any(axis=1)
+    return np.count_nonzero(hit, axis=1)
 
 
 def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
@@ -244,9 +248,13 @@ def fit_lobe_weights(
     The weights' standard error is that of the lobe's overall scale: single weights of nearly
     dependent lobes are not determined.
     """
-    found = brdf_basis.fit_weights(specular_samples(samples, normals, r_d), basis)
+    shine = specular_samples(samples, normals, r_d)
+    found = brdf_basis.fit_weights(shine, basis)
     good = found.valid & normals.valid & r_d.valid
-    scale = np.where(np.isfinite(found.stderr), LOBE_SCALE_ERROR_RATIO * found.stderr, 1.0)
+    views = np.maximum(_count_kinds(shine.valid, samples.view), 1)
+    per_view = np.sqrt(np.count_nonzero(shine.valid, axis=1) / views)
+    known = np.isfinite(found.stderr)
+    scale = np.where(known, LOBE_SCALE_ERROR_RATIO * per_view * found.stderr, 1.0)
     residual = np.where(good, found.residual, 0.0)
     each = np.append(found.weights, residual[:, None], axis=1)
     return PointValues.masked(each, scale[:, None] * each, good)

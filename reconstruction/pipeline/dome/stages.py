@@ -49,7 +49,7 @@ from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 from reconstruction.tiles import MAX_WORKERS
 
-STAGE_REVISION = 9
+STAGE_REVISION = 10
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"

@@ -380,6 +380,32 @@ def one_hot(samples):
     return dataclasses.replace(samples, f=f)
 
 
+def repeated(samples, new_views):
+    """Every sample twice, of the same views or of as many others."""
+    twice = {
+        field.name: np.concatenate([getattr(samples, field.name)] * 2, axis=1)
+        for field in dataclasses.fields(samples)
+        if field.name not in ("light", "view")
+    }
+    other = samples.view + (len(VIEWS) if new_views else 0)
+    views = np.concatenate([samples.view, other])
+    return dataclasses.replace(samples, **twice, light=np.tile(samples.light, 2), view=views)
+
+
+@pytest.mark.parametrize(("new_views", "factor"), [(False, 1.0), (True, np.sqrt(0.5))])
+def test_lobe_errors_fall_with_views_only(new_views, factor):
+    """Lights of a view share the pixel's errors, so that more of them do not help."""
+    truth, basis = cap(20), brdf_tables.default_basis()
+    samples = make(truth, lobe=lambda angle: 0.3 * np.exp(-((angle / 0.3) ** 2)))
+    few = basis.mix_materials(np.eye(len(basis.names))[:2])
+    once, twice = (
+        estimates.fit_lobe_weights(one, known(truth), albedo_of(truth), few)
+        for one in (samples, repeated(samples, new_views))
+    )
+    relative = [found.stderr.max(axis=1) / found.values.max(axis=1) for found in (once, twice)]
+    np.testing.assert_allclose(relative[1], factor * relative[0], rtol=0.02)
+
+
 def by_one_light(samples):
     return dataclasses.replace(samples, valid=samples.valid & (samples.light == 7))
 
