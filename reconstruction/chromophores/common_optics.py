@@ -31,6 +31,9 @@ fractions of skin, 0.002 to 0.07, are read as +-2 of them, as the ranges of
 `model.tissue_optics.uncertainty` are. `POPULATION_LOG_SD` is of single pixels, lips included."""
 LOG_FRACTION_STEP: Final = 0.05
 """Step of the grid in log melanin and in log blood, at most a third of their standard errors."""
+ONE_SIGMA_LEVEL: Final = 0.6827
+HALF_WIDTHS: Final = np.geomspace(1e-3, 1e3, 2001)
+"""Relative half-widths among which that of 68 % is interpolated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,10 +42,10 @@ class CommonOptics:
 
     log_color: Float64Array
     """(3,): most probable log color of the face over that of the model."""
-    log_melanin_sd: float
-    """Standard error of log melanin of the whole face."""
-    log_blood_sd: float
-    """Standard error of log blood of the whole face."""
+    melanin_half_width: float
+    """68 % credible half-width of the whole face's melanin, over its estimate."""
+    blood_half_width: float
+    """68 % credible half-width of the whole face's blood, over its estimate."""
     log_light_sd: float
     """Standard error of log light of the whole face."""
 
@@ -89,7 +92,7 @@ def estimate_common_optics(
     >>> skin = 0.7 * table.lookup(np.full(100, 0.03), 0.011) * [1.06, 1.0, 1.0]
     >>> prior = lognormal_prior(0.7, 0.5)
     >>> found = estimate_common_optics(skin, table, prior=prior, common_light=0.1)
-    >>> bool(found.log_color[0] > found.log_color[1]), bool(0.05 < found.log_melanin_sd < 0.5)
+    >>> bool(found.log_color[0] > found.log_color[1]), bool(0.05 < found.melanin_half_width < 0.5)
     (True, True)
     """
     check = Checks(ChromophoreError)
@@ -121,11 +124,6 @@ def estimate_common_optics(
     weight = np.exp(-0.5 * (cost - cost.min()))
     weight /= weight.sum()
 
-    def deviation(fraction: Float64Array) -> float:
-        log = np.log(fraction)
-        mean = float((weight * log).sum())
-        return float(np.sqrt((weight * np.square(log - mean)).sum()))
-
     error = (optics @ weighted)[..., 0]
     # conditional mean and variance of the common light, given the chromophores
     moved = common_light**2 * weighted[..., 0].sum(axis=-1)
@@ -133,7 +131,22 @@ def estimate_common_optics(
     variance = float((weight * (left + np.square(moved - (weight * moved).sum()))).sum())
     return CommonOptics(
         np.asarray((weight[..., None] * error).sum(axis=(0, 1))),
-        deviation(c_m),
-        deviation(c_hd),
+        _half_width(melanin, weight.sum(axis=1)),
+        _half_width(blood, weight.sum(axis=0)),
         float(np.sqrt(max(variance, 0.0))),
     )
+
+
+def _half_width(fractions: Float64Array, probability: Float64Array) -> float:
+    """Return the 68 % credible half-width over the estimate, of a grid even in the logarithm.
+
+    The posterior of blood has a long tail towards 0. A tail widens the standard deviation of the
+    logarithm more than an interval of the fraction itself, which is what maps state.
+    """
+    log = np.log(fractions)
+    edges = np.append(log - 0.5 * LOG_FRACTION_STEP, log[-1] + 0.5 * LOG_FRACTION_STEP)
+    below = np.append(0.0, np.cumsum(probability))
+    mean = float(probability @ log)
+    ends = 1.0 + HALF_WIDTHS, np.maximum(1.0 - HALF_WIDTHS, 1e-300)
+    high, low = (np.interp(mean + np.log(end), edges, below) for end in ends)
+    return float(np.interp(ONE_SIGMA_LEVEL, high - low, HALF_WIDTHS))

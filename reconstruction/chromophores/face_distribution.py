@@ -36,10 +36,10 @@ MIN_CONTAMINATION: Final = 0.01
 (`reconstruction.chromophores.shading_prior.CONTAMINATION_PROBABILITY`): it keeps moles and lips
 from being pulled to the face's mean."""
 MAX_CONTAMINATION: Final = 0.5
-MIN_SIGMAS: Final = (0.02, 0.05)
+MIN_SIGMAS: Final = (0.02, 0.02)
 """Minimum standard deviations of log melanin, the limit of what colors resolve, and of blood's cube
-root: blood varies by a third to a half over a face, as on simulated subjects of seeds 0 to 7 (0.045
-to 0.050, lips included). That is below the error of a pixel, so colors determine it badly."""
+root. Simulated faces have 0.008 to 0.016 without lips, which `MIN_CONTAMINATION` is for, and 0.03
+to 0.05 with them. That is below the error of a pixel, so colors determine it badly."""
 MAX_SIGMAS: Final = (2.0, 0.5)
 _START_SIGMAS: Final = (0.3, 0.1)
 _SEARCH_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])

@@ -302,8 +302,8 @@ def add_optics_errors(
     if errors.ndim > 2:
         usual = errors[usable].mean(axis=0) if usable.any() else np.zeros((3, 3))
     fitted = invert(colors, table, variance=variance, model_error=usual)
-    melanin = np.float32(common.log_melanin_sd) * found.melanin
-    hemoglobin = np.float32(common.log_blood_sd) * found.hemoglobin
+    melanin = np.float32(common.melanin_half_width) * found.melanin
+    hemoglobin = np.float32(common.blood_half_width) * found.hemoglobin
     return replace(
         found,
         stderr_melanin=np.hypot(found.stderr_melanin, melanin),

@@ -73,7 +73,7 @@ def test_common_error_ignores_order_and_single_outliers(table, melanin, blood, t
 
     found = estimate(rgb)
     assert np.isfinite(found.log_color).all()
-    assert min(found.log_melanin_sd, found.log_blood_sd) > 0.0
+    assert min(found.melanin_half_width, found.blood_half_width) > 0.0
     assert 0.0 < found.log_light_sd < 0.11
     shuffled = estimate(rng.permutation(rgb))
     np.testing.assert_allclose(shuffled.log_color, found.log_color, atol=1e-6)

@@ -25,7 +25,7 @@ from reconstruction.pipeline.flash import sequence_blood
 from reconstruction.pipeline.flash import stages as flash_stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 
-STAGE_REVISION = 9
+STAGE_REVISION = 10
 CURVES_NAME = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAP_NAMES = (*flash_stages.MAP_NAMES, CURVES_NAME)

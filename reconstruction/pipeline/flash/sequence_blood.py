@@ -68,7 +68,7 @@ class SkinColorModel:
         common = estimate_face_optics(rgb, self.table, prior=self.prior, has_white=self.has_white)
         log_color = np.zeros(3) if common is None else common.log_color
         exact = replace(self, table=with_exact_optics(self.table))
-        log_sd = 0.0 if common is None else common.log_blood_sd
+        log_sd = 0.0 if common is None else common.blood_half_width
         return exact, np.exp(-log_color).astype(np.float32), log_sd
 
 

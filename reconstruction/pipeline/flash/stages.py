@@ -39,7 +39,7 @@ from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.pipeline.skin_tone import maps as tone
 from reconstruction.pipeline.skin_tone.maps import SkinReflectance
 
-STAGE_REVISION = 13
+STAGE_REVISION = 14
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from reconstruction.chromophores.common_optics import estimate_common_optics
+from reconstruction.chromophores.common_optics import FACE_BLOOD_LOG_SD, estimate_common_optics
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import ChromophoreError
 from reconstruction.chromophores.shading_prior import lognormal_prior
@@ -24,7 +24,9 @@ def table():
 def draw_face(table, rng, *, pixels=60):
     """Return colors, log melanin and log blood of a face drawn from all the priors."""
     melanin = np.clip(POPULATION_MELANIN * np.exp(rng.standard_normal()), 1e-3, 0.4)
-    blood = np.clip(POPULATION_BLOOD * np.exp(1.5 * rng.standard_normal()), 5e-4, 0.25)
+    blood = np.clip(
+        POPULATION_BLOOD * np.exp(FACE_BLOOD_LOG_SD * rng.standard_normal()), 5e-4, 0.25
+    )
     optics = rng.multivariate_normal(np.zeros(3), table.log_covariance(melanin, blood))
     light = PRIOR.mean + COMMON_LIGHT * rng.standard_normal()
     each = light + 0.4 * rng.standard_normal((pixels, 1))
@@ -35,9 +37,10 @@ def draw_face(table, rng, *, pixels=60):
 
 @pytest.mark.long
 def test_intervals_of_drawn_faces_cover_nominally(table, rng):
-    """Over 300 faces the count within one standard error is binomial about 68 %.
+    """Over 300 faces the count within one half-width is binomial about 68 %.
 
-    The posterior is not normal, so the band is that of 60 to 76 % widened by the sampling error.
+    Medians of pixels are not those of the face's posterior, so the band is that of 60 to 76 %
+    widened by the sampling error.
     """
     faces, inside, narrow = 300, np.zeros(2), np.zeros(2)
     for _ in range(faces):
@@ -53,15 +56,15 @@ def test_intervals_of_drawn_faces_cover_nominally(table, rng):
             model_error=1e-8 * np.eye(3),
             has_white=False,
         ).found
-        for k, (values, truth, sd) in enumerate(
+        for k, (values, truth, half_width) in enumerate(
             (
-                (fitted.melanin, log_melanin, found.log_melanin_sd),
-                (fitted.hemoglobin, log_blood, found.log_blood_sd),
+                (fitted.melanin, log_melanin, found.melanin_half_width),
+                (fitted.hemoglobin, log_blood, found.blood_half_width),
             )
         ):
-            off = abs(np.log(np.median(values)) - truth)
-            inside[k] += off < sd
-            narrow[k] += off < 0.5 * sd
+            off = abs(np.exp(truth) / np.median(values) - 1.0)
+            inside[k] += off < half_width
+            narrow[k] += off < 0.5 * half_width
     sampling = 3.3 * np.sqrt(0.68 * 0.32 / faces)
     assert ((inside / faces > 0.60 - sampling) & (inside / faces < 0.76 + sampling)).all()
     assert (narrow / faces < 0.60 - sampling).all()
@@ -90,7 +93,7 @@ def test_face_of_model_optics_has_small_error(table):
     rgb = 0.7 * table.lookup(np.full(50, POPULATION_MELANIN), POPULATION_BLOOD)
     found = estimate_common_optics(rgb, table, prior=PRIOR, common_light=COMMON_LIGHT)
     assert np.abs(found.log_color).max() < 0.03
-    assert 0.1 < found.log_melanin_sd < 0.5
+    assert 0.1 < found.melanin_half_width < 0.5
 
 
 def test_exact_optics_have_no_common_error(table):
