@@ -6,12 +6,13 @@ no rig measures it in the demo. Crown and neck are those of the fitted mean head
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from model import color_table, spectra
 from model.facial_color.state_maps import NEUTRAL
@@ -20,11 +21,12 @@ from model.skin_reflectance import SkinReflectance, assemble
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.render import Caster
 from rigsim.subject import expressions
 from skinrig import consent
 from skinrig.appearances.contents import hash_document
 from skinrig.applying.expression import read_hemoglobin_rig
-from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt8Array
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt8Array
 from skinrig.atomic_file import replace_folder_atomically
 from skinrig.capturing.camera_colors import fit_skin_colors
 from skinrig.console import to_json_value
@@ -36,10 +38,12 @@ from skinrig.fusing.sources import FusionInputError
 from skinrig.rendering.camera import Camera, look_at
 from skinrig.rendering.folder import apply_tone_curve, choose_exposure
 from skinrig.rendering.geometry import FittedSurface, read_own_mesh
-from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.rendering.hole_patches import ClosedMesh, close_holes, smooth_folds
 from skinrig.rendering.lights import Light
-from skinrig.rendering.render import Rendering, render_light_groups
-from skinrig.unmeasured.person import HEAD_FILE, DisplayedPerson, assemble_person
+from skinrig.rendering.render import render_light_groups
+from skinrig.unmeasured.drawing import PartsLayer, PartsView, open_lids, paint_undercoat
+from skinrig.unmeasured.person import HEAD_FILE, DisplayedPerson, FaceParts, assemble_person
+from skinrig.viewer.assets.face_parts import EXPRESSION_OPENING
 from skinrig.viewer.map_filling import fill_holes
 
 LIGHT_AZIMUTHS_DEG: Final = {
@@ -54,6 +58,9 @@ LIGHT_ELEVATION_DEG: Final = 25.0
 LIGHT_RADIUS_RAD: Final = 0.035
 """Angular radius of a light; its shadows have soft borders."""
 SHADOW_SAMPLES: Final = 2
+HAIR_SUBPIXELS: Final = 2
+EYE_SUBPIXELS: Final = 3
+"""Rays along each side of a pixel on hair of the scalp, and on eyes, brows and lashes."""
 FILL_WEIGHT: Final = 0.3
 """Weight of the mean over all lights, which fills the shadows."""
 CAMERA_MM: Final = (0.0, 0.0, 700.0)
@@ -118,28 +125,44 @@ def render_finished_face(
     require_choice(
         "expression", expression, tuple(expressions.EXPRESSION_STRENGTHS), FusionInputError
     )
+    # many small systems of equations: threads of BLAS wait for each other
+    with threadpool_limits(1, "blas"):
+        return _render_frames(double, moving, expression, seed)
+
+
+def _render_frames(
+    double: FusedDouble, moving: SkinAppearance, expression: str, seed: int
+) -> FinishedFace:
+    """Render the frames, see `render_finished_face`."""
     whole = complete_skin(double.appearance, assemble(double.appearance), seed=seed)
     mesh = whole.person.mesh
     moved_mm = expressions.displacement_mm(mesh, expression, seed=seed)
     skin = _MovingColor.of(double, whole, moving, expression)
+    view = scalp = None
+    if (parts := _find_parts(whole.person)) is not None:
+        lights = build_lights(LIGHT_AZIMUTHS_DEG)
+        view = PartsView(parts, mesh, aim_camera(FRAME_PX), lights)
+        scalp = view.draw(mesh, Caster(mesh), ("scalp",), 0.0, HAIR_SUBPIXELS)
+    gain = EXPRESSION_OPENING.get(expression, 0.0)
     weights = np.linspace(0.0, 1.0, N_STEPS)
-    steps = [_render_step(skin.at(float(w)), mesh, np.float32(w) * moved_mm) for w in weights]
+    steps = [
+        _render_step(skin.at(w), mesh, w * moved_mm, view, scalp, 1.0 + w * gain)
+        for w in weights.tolist()
+    ]
     left_out = (
-        *_list_unmeasured(whole.person),
+        *whole.person.added(),
+        *whole.person.omitted(),
         ("movement of this face", "no rig measures it here; the blend shapes are simulated"),
         ("fine wrinkles", "the fused maps have none"),
-        ("open eyes and hair", "not drawn here, as no rig measures them"),
+        ("folded triangles of the scan", "smoothed; their color and normals are the maps'"),
     )
     return FinishedFace(
         _develop(steps), expression, tuple(weights.tolist()), skin.known_fraction, seed, left_out
     )
 
 
-def _list_unmeasured(person: DisplayedPerson | ClosedMesh) -> Iterator[tuple[str, str]]:
-    """Yield what was not measured, except for eyes and hair, which are not drawn."""
-    parts = person.parts if isinstance(person, DisplayedPerson) else None
-    undrawn = None if parts is None else ", ".join(parts.names)
-    yield from (row for row in (*person.added(), *person.omitted()) if row[0] != undrawn)
+def _find_parts(person: DisplayedPerson | ClosedMesh) -> FaceParts | None:
+    return person.parts if isinstance(person, DisplayedPerson) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,12 +198,18 @@ def complete_skin(
         Seed of the person's parts that no rig measured.
     """
     closed = close_holes(read_own_mesh(appearance))
+    closed = dataclasses.replace(closed, mesh=smooth_folds(closed.mesh))
     has_head = HEAD_FILE in appearance.files
     person = assemble_person(appearance, closed, seed) if has_head else closed
     atlas = unwrap(person.mesh, model.valid.shape[0])
     missing = atlas.covered & ~model.valid
     # false beyond it, at the rim of a scan: they face away from a camera in front of the skin
     turned = np.einsum("hwk,hwk->hw", atlas.normal, model.normals) < MIN_NORMAL_COSINE
+    to_camera = np.array(CAMERA_MM) - atlas.position_mm
+    mesh_cosine, cosine = (
+        np.einsum("hwk,hwk->hw", one, to_camera) for one in (atlas.normal, model.normals)
+    )
+    turned |= (mesh_cosine > 0.0) & (cosine <= 0.0)
     smooth = (missing | (atlas.covered & turned))[..., None]
     count = model.r_d.shape[-1]
     values = np.concatenate([model.r_d, model.weights], axis=-1)
@@ -231,13 +260,16 @@ class _MovingColor:
         good = melanin.mask & blood.mask
         rgb, _ = fit_skin_colors(bands.camera, bands.illuminant)
         shown = np.clip(np.asarray(whole.model.r_d, np.float64) @ rgb, 0.0, 1.0)
+        model = dataclasses.replace(whole.model, r_d=shown.astype(np.float32))
+        if (parts := _find_parts(whole.person)) is not None:
+            model = paint_undercoat(model, whole.person.mesh, parts)
         layers = [fill_holes(one.values, good) for one in (melanin, blood)]
         layers.append(fill_holes(change, known))
         texels = whole.model.valid
         painted = whole.person.paint(np.stack(layers, axis=-1))[texels].astype(np.float64)
         melanin_there, blood_there, change_there = np.moveaxis(painted, -1, 0)
         return _MovingColor(
-            dataclasses.replace(whole.model, r_d=shown.astype(np.float32)),
+            model,
             melanin_there,
             blood_there,
             change_there,
@@ -283,22 +315,39 @@ def build_lights(azimuths_deg: Mapping[str, float]) -> tuple[Light, ...]:
 
 
 def _render_step(
-    model: SkinReflectance, rest: Mesh, moved_mm: Float32Array
-) -> tuple[Rendering, ...]:
-    """Render a moved face, one image per light."""
-    mesh = build_mesh(rest.vertices_mm + moved_mm, rest.faces, rest.uv)
-    surface = FittedSurface.of(model, mesh, rest=rest)
-    lights = [[light] for light in build_lights(LIGHT_AZIMUTHS_DEG)]
-    return render_light_groups(
-        surface, aim_camera(FRAME_PX), lights, subpixels=1, shadow_samples=SHADOW_SAMPLES
+    model: SkinReflectance,
+    rest: Mesh,
+    moved_mm: Float32Array,
+    view: PartsView | None,
+    scalp: PartsLayer | None,
+    opening: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the radiance of a moved face by light, (L, H, W, 3), and its coverage, (H, W)."""
+    vertices = rest.vertices_mm + moved_mm
+    if view is not None:
+        vertices = open_lids(vertices, view.parts.lids, opening)
+    mesh = build_mesh(vertices, rest.faces, rest.uv)
+    caster = Caster(mesh)
+    found = render_light_groups(
+        FittedSurface.of(model, mesh, rest=rest),
+        aim_camera(FRAME_PX),
+        [[light] for light in build_lights(LIGHT_AZIMUTHS_DEG)],
+        subpixels=1,
+        shadow_samples=SHADOW_SAMPLES,
+        caster=caster,
     )
+    image = np.stack([one.radiance for one in found]), found[0].coverage
+    if view is None or scalp is None:
+        return image
+    front = view.draw(mesh, caster, ("brow", "lash"), opening, EYE_SUBPIXELS)
+    return scalp.draw_over(*front.draw_over(*image))
 
 
-def _develop(steps: list[tuple[Rendering, ...]]) -> UInt8Array:
+def _develop(steps: list[tuple[FloatArray, FloatArray]]) -> UInt8Array:
     """Return display images, (L, S, H, W, 3), of one exposure, with filled shadows."""
-    radiance = np.stack([[one.radiance for one in step] for step in steps], axis=1)
+    radiance = np.stack([one for one, _ in steps], axis=1)
     radiance = radiance + FILL_WEIGHT * radiance.mean(axis=0)
-    coverage = np.stack([step[0].coverage for step in steps])[..., None]
+    coverage = np.stack([one for _, one in steps])[..., None]
     front = list(LIGHT_AZIMUTHS_DEG).index("front")
     exposure = choose_exposure(radiance[front, 0], coverage[0, ..., 0])
     skin = apply_tone_curve(radiance / np.maximum(coverage, 1e-3), exposure)

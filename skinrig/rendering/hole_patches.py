@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from reconstruction.scan.hole_patches import HolePatch, find_patches
 from rigsim.geometry.atlas import unwrap
@@ -23,6 +23,12 @@ PATCH_MARGIN: Final = 4.0 / 256.0
 """Minimum distance of a disc from charts: four texels of a map of 256, for texture filters."""
 MIN_RELATIVE_SCALE: Final = 0.25
 """Minimum texture scale of a patch relative to its surroundings; below it, the hole stays open."""
+MIN_FOLD_COSINE: Final = 0.5
+"""Cosine between a triangle's normal and the mean within `FOLD_RINGS` below which it is folded."""
+FOLD_RINGS: Final = 3
+FOLD_ROUNDS: Final = 8
+FOLD_STEPS: Final = 5
+"""Most searches for folds, and steps of smoothing after each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +144,43 @@ def close_holes(mesh: Mesh) -> ClosedMesh:
         count += len(whole)
     joined = build_mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv))
     return ClosedMesh(joined, tuple(charts), tuple(open_mm))
+
+
+def smooth_folds(mesh: Mesh) -> Mesh:
+    """Return a mesh without folded triangles, which shadow each other and have false normals.
+
+    Their vertices, and no others, move to the mean of their neighbors. Texture coordinates stay.
+
+    Parameters
+    ----------
+    mesh
+        Mesh without blend shapes.
+    """
+    points = mesh.vertices_mm.astype(np.float64)
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    same = first[place.reshape(-1)]
+    joined, total = same[mesh.faces], len(points)
+    number = np.repeat(np.arange(len(joined)), 3)
+    corner = sparse.csr_matrix((np.ones(len(number)), (joined.reshape(-1), number)))
+    corner.resize(total, len(joined))
+    near = corner @ corner.T
+    near.setdiag(0.0)
+    near.data[:] = near.data > 0.0
+    for _ in range(FOLD_ROUNDS):
+        a, b, c = (points[joined[:, k]] for k in range(3))
+        normals = np.cross(b - a, c - a)
+        around = normals
+        for _ in range(FOLD_RINGS):
+            around = corner.T @ (corner @ around)
+        cosine = np.einsum("fk,fk->f", normals, around)
+        length = np.linalg.norm(normals, axis=1) * np.linalg.norm(around, axis=1)
+        rows = np.unique(joined[cosine < MIN_FOLD_COSINE * length])
+        if not len(rows):
+            break
+        for _ in range(FOLD_STEPS):
+            points[rows] = (near[rows] @ points) / near[rows].sum(axis=1)
+    same_place = np.array_equal(points, mesh.vertices_mm)
+    return mesh if same_place else build_mesh(points[same], mesh.faces, mesh.uv)
 
 
 def _area(points: FloatArray, faces: NDArray[np.integer]) -> float:

@@ -78,7 +78,7 @@ def build_assets(source: SceneSource) -> Assets:
         "hair_steps_per_mm": HAIR_STEPS_PER_MM,
         "counts": dict(zip(HAIR_KINDS, hair.counts, strict=True)),
         "width_mm": WIDTH_MM,
-        **_describe_colors(hair),
+        **describe_colors(hair),
         "eyes": eyes,
         "label": label,
         "opening": EXPRESSION_OPENING,
@@ -108,10 +108,11 @@ def build_colors(mesh: Mesh, preset: str, seed: int) -> dict[str, list[float]]:
     dict
         Absorption per radius, albedo of multiple scattering, and linear sRGB of the iris.
     """
-    return _describe_colors(draw_hair(mesh, preset, seed=seed))
+    return describe_colors(draw_hair(mesh, preset, seed=seed))
 
 
-def _describe_colors(hair: Hair) -> dict[str, list[float]]:
+def describe_colors(hair: Hair) -> dict[str, list[float]]:
+    """Return absorption per radius and multiple scattering of hair, and linear sRGB of the iris."""
     return {
         "absorption": hair.absorption_per_radius().tolist(),
         "multiple_scattering": _multiple_scattering(hair).tolist(),

@@ -200,6 +200,8 @@ def test_unmeasured_texels_have_normals_of_the_mesh(head):
         if known is valid:
             np.testing.assert_allclose(found.r_d[hole], model.r_d[hole], rtol=1e-5)
         kept = valid & covered
+        to_camera = np.array(finished_face.CAMERA_MM) - appearance.maps["position"].values
+        kept &= np.einsum("hwk,hwk->hw", model.normals, to_camera) > 0.0
         np.testing.assert_array_equal(found.normals[kept], model.normals[kept])
 
 
@@ -220,3 +222,16 @@ def test_crown_and_neck_continue_the_scan():
         whole.model.r_d[everywhere], np.broadcast_to(R_D, (everywhere.sum(), 3)), rtol=1e-3
     )
     assert {"crown", "neck"} <= set(whole.person.regions)
+    named = dataclasses.replace(appearance, files=files)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finished_face, "FRAME_PX", FRAME_PX)
+        bald, haired = (
+            render_finished_face(
+                person((one, everywhere)), moving(HEAD_BLOOD), expression="anger", seed=0
+            )
+            for one in (appearance, named)
+        )
+    assert any(part.startswith("eyes, ") for part, _ in haired.left_out)
+    assert not any(part.startswith("eyes, ") for part, _ in bald.left_out)
+    top = np.s_[2, 0, 4:12, FRAME_PX[0] // 3 : -FRAME_PX[0] // 3]
+    assert haired.frames[top].mean() < 0.6 * bald.frames[top].mean()

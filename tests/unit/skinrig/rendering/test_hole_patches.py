@@ -151,3 +151,32 @@ def test_texture_without_room_leaves_hole_open_and_reports(scan):
     assert closed.charts == ()
     assert len(closed.open_loops_mm) >= 2
     assert closed.summary()[0][0] == "open holes"
+
+
+def test_folded_triangles_unfold_and_others_stay():
+    """Rationale: a plane with a vertex beyond its neighbors has triangles that face down."""
+    side = 9
+    x, y = np.meshgrid(np.arange(float(side)), np.arange(float(side)))
+    points = np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3)
+    a = np.arange(side * side).reshape(side, side)
+    quads = [a[:-1, :-1], a[:-1, 1:], a[1:, 1:], a[1:, :-1]]
+    q = np.stack(quads, axis=-1).reshape(-1, 4)
+    faces = np.concatenate([q[:, [0, 1, 2]], q[:, [0, 2, 3]]])
+    plane = build_mesh(points, faces, points[:, :2] / side)
+    same = patch_charts.smooth_folds(plane)
+    np.testing.assert_array_equal(same.vertices_mm, plane.vertices_mm)
+    points[a[4, 4]] += (1.7, 0.2, 0.3)
+    folded = build_mesh(points, faces, plane.uv)
+    found = patch_charts.smooth_folds(folded).vertices_mm
+
+    def up(vertices):
+        one, two, three = (vertices[faces[:, k]] for k in range(3))
+        return np.cross(two - one, three - one)[:, 2]
+
+    assert up(folded.vertices_mm).min() < 0.0
+    assert up(found).min() > 0.0
+    moved = np.abs(found - folded.vertices_mm).max(axis=1) > 0.0
+    rows, columns = np.divmod(np.flatnonzero(moved), side)
+    assert moved[a[4, 4]]
+    assert np.abs(rows - 4).max() <= 1
+    assert np.abs(columns - 4).max() <= 2
