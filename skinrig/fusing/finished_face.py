@@ -203,13 +203,13 @@ def complete_skin(
     person = assemble_person(appearance, closed, seed) if has_head else closed
     atlas = unwrap(person.mesh, model.valid.shape[0])
     missing = atlas.covered & ~model.valid
-    # false beyond it, at the rim of a scan: they face away from a camera in front of the skin
+    # false at the rim of a scan: they face away from a camera in front of the skin
     turned = np.einsum("hwk,hwk->hw", atlas.normal, model.normals) < MIN_NORMAL_COSINE
     to_camera = np.array(CAMERA_MM) - atlas.position_mm
     mesh_cosine, cosine = (
         np.einsum("hwk,hwk->hw", one, to_camera) for one in (atlas.normal, model.normals)
     )
-    turned |= (mesh_cosine > 0.0) & (cosine <= 0.0)
+    turned = (turned & (mesh_cosine > cosine)) | ((mesh_cosine > 0.0) & (cosine <= 0.0))
     smooth = (missing | (atlas.covered & turned))[..., None]
     count = model.r_d.shape[-1]
     values = np.concatenate([model.r_d, model.weights], axis=-1)

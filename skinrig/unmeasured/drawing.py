@@ -240,7 +240,7 @@ class _Eye:
     albedo: Float64Array
     beside: Float64Array
     """Visible point of the iris from its center, across the gaze, mm; 0 on the sclera."""
-    way: Float64Array
+    way: FloatArray
 
     @staticmethod
     def at(
