@@ -28,7 +28,7 @@ MIN_FOLD_COSINE: Final = 0.5
 FOLD_RINGS: Final = 3
 FOLD_ROUNDS: Final = 8
 FOLD_STEPS: Final = 5
-"""Most searches for folds, and steps of smoothing after each."""
+"""Number of searches for folds, and steps of smoothing after each; folds that are left stay."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,9 +175,7 @@ def smooth_folds(mesh: Mesh) -> Mesh:
         cosine = np.einsum("fk,fk->f", normals, around)
         length = np.linalg.norm(normals, axis=1) * np.linalg.norm(around, axis=1)
         rows = np.unique(joined[cosine < MIN_FOLD_COSINE * length])
-        if not len(rows):
-            break
-        for _ in range(FOLD_STEPS):
+        for _ in range(FOLD_STEPS if len(rows) else 0):
             points[rows] = (near[rows] @ points) / near[rows].sum(axis=1)
     same_place = np.array_equal(points, mesh.vertices_mm)
     return mesh if same_place else build_mesh(points[same], mesh.faces, mesh.uv)

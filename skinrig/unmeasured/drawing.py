@@ -52,7 +52,7 @@ class PartsLayer:
     Attributes
     ----------
     radiance : ndarray of float64, shape (L, H, W, 3)
-        By light; 0 beside the parts, averaged over each pixel.
+        By light; 0 outside the parts, averaged over each pixel.
     coverage : ndarray of float64, shape (H, W)
         Fraction of a pixel that eyes and hair cover, 0 to 1.
     hidden : ndarray of float64, shape (H, W)
@@ -69,7 +69,7 @@ class PartsLayer:
         """Return the images, (L, H, W, 3), and the coverage, (H, W), of skin with the parts."""
         shown = 1.0 - self.hidden
         covered = self.coverage + shown * coverage
-        # the background is not visible beside an eye, where the rays of both images differ
+        # the background is not visible next to an eye, where the rays of both images differ
         at_eye = self.coverage > self.hidden
         scale = 1.0 / np.where(at_eye, covered, np.maximum(covered, 1.0))
         both = self.radiance + shown[..., None] * radiance
@@ -238,7 +238,7 @@ class _Eye:
     shading: Float64Array
     """Normal of the diffuse reflection."""
     albedo: Float64Array
-    beside: Float64Array
+    off_axis: Float64Array
     """Visible point of the iris from its center, across the gaze, mm; 0 on the sclera."""
     way: FloatArray
 
@@ -265,10 +265,10 @@ class _Eye:
         bent = way / ETA_CORNEA + bend * normal
         deep = eyelids.APEX_MM - eyelids.CHAMBER_DEPTH_MM
         ahead = (point @ gaze)[:, None]
-        beside = point + (deep - ahead) / np.minimum(bent @ gaze, -0.05)[:, None] * bent
-        beside = np.where(cornea, beside - deep * gaze, 0.0)
+        off_axis = point + (deep - ahead) / np.minimum(bent @ gaze, -0.05)[:, None] * bent
+        off_axis = np.where(cornea, off_axis - deep * gaze, 0.0)
         right = _normalize(np.cross([0.0, 1.0, 0.0], gaze))
-        x, y = beside @ right, beside @ np.cross(gaze, right)
+        x, y = off_axis @ right, off_axis @ np.cross(gaze, right)
         reach, angle = np.hypot(x, y) / IRIS_RADIUS_MM, np.arctan2(y, x)
         fibers = 0.5 + 0.35 * np.sin(13.0 * angle + 3.0 * reach) * np.sin(5.0 * angle - 7.0 * reach)
         bright = (0.45 + 1.15 * fibers) * (1.0 - 0.72 * _smooth((reach - 0.76) / 0.21))
@@ -282,7 +282,7 @@ class _Eye:
         sclera = sclera * (0.44 + 0.56 * _smooth((eyelids.LIMBUS_MM - ahead + 0.1) / 0.85))
         albedo = (1.0 - limbus) * bright[:, None] * iris + limbus * sclera
         shading = _normalize((1.0 - limbus) * gaze + limbus * normal)
-        return _Eye(normal, shading, albedo, beside, way)
+        return _Eye(normal, shading, albedo, off_axis, way)
 
     def shade(self, towards: Float64Array) -> Float64Array:
         """Return the radiance by light from a direction, relative to a white patch's, (n, 3)."""
@@ -293,7 +293,7 @@ class _Eye:
             *cosines, _dot(half, towards), roughness=EYE_ROUGHNESS, eta=ETA_CORNEA
         )
         # the cornea gathers light on the far side of the iris
-        gathered = 1.0 - _dot(self.beside, towards) / (2.0 * IRIS_RADIUS_MM)
+        gathered = 1.0 - _dot(self.off_axis, towards) / (2.0 * IRIS_RADIUS_MM)
         wrapped = np.clip((_dot(self.shading, towards) + 0.12) / 1.12, 0.0, 1.0)
         return gathered * wrapped * self.albedo + np.pi * film * np.maximum(cosine, 0.0)
 
@@ -345,7 +345,7 @@ def _lobe(x: Float64Array, width: float) -> Float64Array:
 
 
 def _meet(start: Float64Array, way: FloatArray, radius: float) -> Float64Array:
-    """Return the distance, (n, 1), at which rays enter a sphere at 0; NaN beside it."""
+    """Return the distance, (n, 1), at which rays enter a sphere at 0; NaN for rays that miss it."""
     along = _dot(start, way)
     rest = along**2 - _dot(start, start) + radius**2
     return -along - np.sqrt(np.where(rest > 0.0, rest, np.nan))
