@@ -1,7 +1,8 @@
 """Run the demo: simulate, capture, calibrate, reconstruct, fuse, measure and report.
 
-The report is written when the first rig is done, and again after each further rig. Sections of
-earlier reports are reused.
+A part of it, such as a rig, begins when those that it needs are done. The report is written after
+the first rig, after each further one, and when the person is fused. Sections of earlier reports are
+reused.
 """
 
 import json
@@ -11,23 +12,35 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from skinrig.atomic_file import write_atomically
-from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
-from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, choose_width, fuse_person
+from skinrig.demo_rigs import (
+    DOUBLE_FOLDER,
+    FACE_PART,
+    HEAD_PART,
+    PARTS,
+    PERSON_PART,
+    PHOTOGRAPHS_PART,
+    RIGS,
+    DemoResults,
+    RigDemo,
+    choose_width,
+    list_parts,
+)
 from skinrig.errors import EXIT_INTERRUPTED, UnusableError
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
-from skinrig.progress import beat_while_running
+from skinrig.progress import beat_while_running, watch
 from skinrig.resources.forecast import measure_folder_mb, require_resources_of_jobs
 from skinrig.simulating.simulation import list_tasks
 from skinrig.unit_format import format_unit
@@ -37,7 +50,7 @@ if TYPE_CHECKING:
     from skinrig.reporting.drawn_sections import DrawnSections
 
 MAX_JOBS = 2
-"""Rigs that run in parallel: much of each uses one core only, or waits for a compiler."""
+"""Parts that run in parallel: much of each uses one core only, or waits for a compiler."""
 BENCH_STAGES = (
     "hdr",
     "normals",
@@ -53,14 +66,21 @@ BENCH_STAGES = (
 )
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
-PERSON_PART = "person"
-"""Part of the demo after the rigs: their maps of the person are fused."""
-TYPICAL_SECONDS = {"flash": 45.0, "dome": 110.0, "gradient": 60.0, "probe": 30.0, PERSON_PART: 8.0}
-"""Seconds of each part while another one runs, on two cores, in the order in which they start.
+TYPICAL_SECONDS = {
+    **{"flash": 45.0, "dome": 100.0, PHOTOGRAPHS_PART: 10.0, "gradient": 60.0, "probe": 30.0},
+    **{HEAD_PART: 5.0, PERSON_PART: 7.0, FACE_PART: 6.0},
+}
+"""Seconds of each part while another one runs, on two cores.
 
-They lie between those with and without compiled kernels. The flash rig starts first: its maps are
-in the report while the other rigs run.
+They lie between those with and without compiled kernels.
 """
+FOLLOWING = {
+    **dict.fromkeys(RIGS, "other rigs follow"),
+    PERSON_PART: "the fused person follows",
+    PHOTOGRAPHS_PART: "held-out photographs follow",
+    FACE_PART: "the finished face follows",
+}
+"""End of the title of a preliminary report, by the first of these parts that it lacks."""
 REPORT_NAME = "report.html"
 MARK_NAME = ".skinrig-demo"
 """File that marks the folder of a demo."""
@@ -110,22 +130,29 @@ def run_demo(
     _make_room(out)
     began = time.perf_counter()
     parts: _Parts = {}
-    wanted = [*asked, PERSON_PART] if _can_fuse(asked) else asked
+    needs = list_parts(asked)
     write_report = partial(_write_report, out, drawn=_keep_sections())
-    for name, part in _run_parts(asked, (out, seed, width_px, console), at_once):
+    own: SecondsByStep = {}
+    for name, part in _run_parts(needs, (out, seed, width_px, console), at_once):
         parts[name] = part
-        waiting = [one for one in wanted if one not in parts]
-        if waiting:
-            write_report(parts, _sum_up(wanted, parts), waiting=waiting)
+        waiting = [one for one in needs if one not in parts]
+        if waiting and name in (*asked, PERSON_PART):
+            write_report(parts, _sum_up(needs, parts), waiting=waiting)
             console.print_line(
-                f"{name}: done, {len(parts)} of {len(asked)} rigs, "
+                f"{name}: done, {len(parts.keys() & asked)} of {len(asked)} rigs, "
                 f"about {_estimate_left_s(parts, waiting, at_once):.0f} s left; "
                 f"the report so far: {out / REPORT_NAME}"
             )
-    found, shares = _sum_up(wanted, parts)
-    with _time_step("measure error against run time", shares, console):
-        quiet = replace(console, quiet=True)  # the report shows its tables
-        bench = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
+        if name in asked and parts.keys() >= {*asked}:  # while the person is fused
+            from skinrig.benchmarks.stages import run_stages  # slow to import
+
+            quiet = replace(console, quiet=True)  # the report shows its tables
+            with _time_step("measure error against run time", own, console):
+                bench = run_stages(
+                    BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet
+                )
+    found, shares = _sum_up(needs, parts)
+    shares |= own
     with _time_step("report", shares, console):
         write_report(parts, (found, shares), waiting=())
     console.print_line("")
@@ -176,11 +203,11 @@ _Part = tuple[DemoResults, SecondsByStep]
 _Parts = dict[str, _Part]
 
 
-def _sum_up(wanted: Sequence[str], parts: _Parts) -> _Part:
+def _sum_up(needs: Iterable[str], parts: _Parts) -> _Part:
     """Return the results and seconds of the parts that are done, in the order of the report."""
     found = DemoResults()
     shares: SecondsByStep = {}
-    for name in wanted:
+    for name in needs:
         if name in parts:
             found.errors += parts[name][0].errors
             found.tables += parts[name][0].tables
@@ -197,7 +224,7 @@ def _keep_sections() -> "DrawnSections":
 
 def _write_report(
     out: Path,
-    rigs: Iterable[str],
+    parts: Iterable[str],
     results: _Part,
     *,
     waiting: Sequence[str],
@@ -214,15 +241,18 @@ def _write_report(
     # run times differ from run to run, so they go to a document of their own, not into the maps
     written = out / "demo.json"
     write_atomically(written, json.dumps(to_json_value(document), indent=1))
-    done = set(rigs)  # the folders of the others are growing
+    done = set(parts)  # the folders of the others are growing
     paths = [out]
     title = "skinrig demo"
     if waiting:
-        paths = [one for one in sorted(out.iterdir()) if done & set(one.name.split("-"))]
-        paths.append(written)
-        follows = (
-            "the fused person follows" if set(waiting) == {PERSON_PART} else "other rigs follow"
-        )
+        names = done | ({DOUBLE_FOLDER} if PERSON_PART in done else set())
+        paths = [
+            one
+            for one in sorted(out.iterdir())
+            if names & set(one.name.split("-")) and not one.name.startswith(".")
+        ]
+        paths += [one for one in (written, out / "bench.json") if one.exists()]
+        follows = next(text for part, text in FOLLOWING.items() if part in waiting)
         title += f": {', '.join(rig for rig in RIGS if rig in done)}; {follows}"
     reload_s = RELOAD_S if waiting else None
     html = build(paths, title=title, reload_s=reload_s, folder=out, drawn=drawn)
@@ -236,48 +266,42 @@ def _estimate_left_s(parts: _Parts, waiting: Sequence[str], at_once: int) -> flo
     return pace * sum(TYPICAL_SECONDS[rig] for rig in waiting) / at_once
 
 
-def _can_fuse(rigs: Sequence[str]) -> bool:
-    """Return whether rigs have maps of one person that can be fused."""
-    return {"flash", "dome"} <= set(rigs)
-
-
-def _run_parts(rigs: Sequence[str], order: _Order, at_once: int) -> Iterator[tuple[str, _Part]]:
-    """Yield each rig with its results when it is done, then the fused person."""
-    first = [rig for rig in TYPICAL_SECONDS if rig in rigs]
+def _run_parts(
+    needs: Mapping[str, Sequence[str]], order: _Order, at_once: int
+) -> Iterator[tuple[str, _Part]]:
+    """Yield each part with its results when it is done."""
     if at_once > 1:
-        yield from _run_in_processes(first, order, at_once)
+        yield from _run_in_processes(needs, order, at_once)
         return
-    errors: list[list[Any]] = []
-    for rig in first:
-        part = _run_rig(rig, *order)
-        errors += part[0].errors
-        yield rig, part
-    if _can_fuse(rigs):
-        yield PERSON_PART, _fuse_rigs(rigs, errors, *order)
+    found: dict[str, DemoResults] = {}
+    for name, before in needs.items():
+        part = _run_part(name, {one: found[one] for one in before}, *order)
+        found[name] = part[0]
+        yield name, part
 
 
 def _run_in_processes(
-    rigs: Sequence[str], order: _Order, at_once: int
+    needs: Mapping[str, Sequence[str]], order: _Order, at_once: int
 ) -> Iterator[tuple[str, _Part]]:
-    """Run each rig in its own process, then the fusion; an error in one stops all."""
+    """Run each part in a process of a pool; an error in one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent
     )
     try:
+        schedule = _Schedule(pool, needs, order)
         # the pool starts its processes on submission
         with _environment(PASSIVE_WAIT_SETTINGS), _delayed_signals():
-            futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
+            schedule.begin_ready()
             pool.submit(os.getpid)  # else the end of the process started last goes unnoticed
-        fusion = _Fusion(pool, futures, order) if _can_fuse(rigs) else None
-        for done in as_completed(futures):
-            yield futures[done], done.result()
-        if fusion is not None:
-            yield PERSON_PART, fusion.start().result()
+        watch(None)  # the parts report their own steps
+        for _ in needs:
+            yield schedule.wait_for_next()
     except BaseException as error:
         for process in multiprocessing.active_children():
             process.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
+            rigs = [part for part in needs if part in RIGS]
             raise DemoError(
                 f"a process of the demo was ended by the system, expected it to finish one of "
                 f"{', '.join(rigs)}; run it again with more memory, or rig by rig: --rigs {rigs[0]}"
@@ -287,29 +311,42 @@ def _run_in_processes(
         pool.shutdown()
 
 
-class _Fusion:
-    """Fusion that begins when all rigs are done, while this process may still draw a report."""
+class _Schedule:
+    """Parts that begin in a pool when those that they need are done.
 
-    def __init__(self, pool: Executor, rigs: Mapping[Future[_Part], str], order: _Order):
-        self._pool, self._rigs, self._order = pool, tuple(rigs), order
-        self._asked = tuple(rigs.values())
-        self._started: Future[_Part] | None = None
-        self._lock = threading.Lock()
-        for one in rigs:
-            one.add_done_callback(self._start_after_last)
+    This process may draw a report meanwhile.
+    """
 
-    def start(self) -> Future[_Part]:
-        """Return the running fusion; the first call starts it."""
+    def __init__(self, pool: Executor, needs: Mapping[str, Sequence[str]], order: _Order):
+        self._pool, self._needs, self._order = pool, needs, order
+        self._begun: dict[str, Future[_Part]] = {}
+        self._ended: SimpleQueue[str] = SimpleQueue()
+        self._lock = threading.RLock()
+
+    def begin_ready(self) -> None:
+        """Begin the parts that wait for no other."""
         with self._lock:
-            if self._started is None:
-                errors = [row for one in self._rigs for row in one.result()[0].errors]
-                self._started = self._pool.submit(_fuse_rigs, self._asked, errors, *self._order)
-            return self._started
+            done = {n: f.result()[0] for n, f in self._begun.items() if _has_succeeded(f)}
+            for name, before in self._needs.items():
+                if name not in self._begun and done.keys() >= {*before}:
+                    given = {one: done[one] for one in before}
+                    self._begun[name] = self._pool.submit(_run_part, name, given, *self._order)
+                    self._begun[name].add_done_callback(partial(self._end, name))
 
-    def _start_after_last(self, _: Future[_Part]) -> None:
-        done = all(one.done() and not one.cancelled() for one in self._rigs)
-        if done and not any(one.exception() for one in self._rigs):
-            self.start()
+    def wait_for_next(self) -> tuple[str, _Part]:
+        """Return the next part that ends; raise its error, or that of a pool that ended."""
+        self.begin_ready()
+        name = self._ended.get()
+        return name, self._begun[name].result()
+
+    def _end(self, name: str, _: Future[_Part]) -> None:
+        with suppress(RuntimeError):  # the pool ended; `wait_for_next` raises this error
+            self.begin_ready()
+        self._ended.put(name)
+
+
+def _has_succeeded(future: Future[_Part]) -> bool:
+    return future.done() and not future.cancelled() and future.exception() is None
 
 
 @contextmanager
@@ -362,32 +399,21 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _run_rig(
-    rig: str, out: Path, seed: int, width_px: int | None, console: Console
-) -> tuple[DemoResults, SecondsByStep]:
-    return _run_part(RIGS[rig], out, seed, width_px, console)
-
-
 def _run_part(
-    run_part: Callable[[RigDemo], None],
+    name: str,
+    before: Mapping[str, DemoResults],
     out: Path,
     seed: int,
     width_px: int | None,
     console: Console,
 ) -> _Part:
     """Return the results and seconds of a part of the demo."""
-    found = DemoResults()
     shares: SecondsByStep = {}
     with beat_while_running():
         timer = partial(_time_step, seconds=shares, console=console)
-        run_part(RigDemo(out, seed, timer, width_px, found))
-    return found, shares
-
-
-def _fuse_rigs(rigs: Sequence[str], errors: Sequence[list[Any]], *order: Any) -> _Part:
-    """Fuse the person's maps of rigs that are done, and show the errors that they found."""
-    in_order = [rig for rig in RIGS if rig in rigs]
-    return _run_part(lambda run: fuse_person(run, in_order, errors), *order)
+        run = RigDemo(out, seed, timer, width_px, before)
+        PARTS[name](run)
+    return run.found, shares
 
 
 @contextmanager
@@ -396,6 +422,7 @@ def _time_step(name: str, seconds: SecondsByStep, console: Console) -> Iterator[
     start = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - start
+    watch(None)  # this process may wait for others now
 
 
 def _make_room(out: Path) -> None:

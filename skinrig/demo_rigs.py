@@ -1,35 +1,33 @@
 """Run the demo of each rig: simulate, capture, calibrate, reconstruct and measure.
 
-Each rig runs in its own process, which compiles the kernels it imports. Modules that only one
-rig needs are therefore imported in its function.
+Each rig runs in its own process, which compiles the kernels it imports. Modules that only some
+rigs need are therefore imported in functions; the command's own process needs none of them.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
-from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.inputs import DomeOptions
-from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
-from skinrig.applying.expression import read_hemoglobin_rig
-from skinrig.calibrating.calibrate import calibrate
-from skinrig.calibrating.gradient import GradientSurveys
-from skinrig.capturing.light_safety import light_rows
-from skinrig.evaluating import facial_color, flash, microrelief, subsurface
-from skinrig.evaluating import surface as surface_evaluation
-from skinrig.fitting.facial_color import fit_facial_color
-from skinrig.fitting.microstructure import fit_microstructure
-from skinrig.rendering.photographs.errors import FULL_MODEL
-from skinrig.reporting.map_names import state_title
 from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
+if TYPE_CHECKING:
+    from skinrig.calibrating.gradient import GradientSurveys
+    from skinrig.fusing.double import FusedDouble
+    from skinrig.fusing.unmeasured import UnmeasuredParts
+
+RIGS = ("flash", "dome", "gradient", "probe")
+HEAD_PART = "head"
+PHOTOGRAPHS_PART = "photographs"
+PERSON_PART = "person"
+FACE_PART = "face"
+"""Parts of the demo after the rigs that they need."""
 DEMO_SUBJECT = "III"
 """Skin type of the one person in front of flash rig, dome and probe."""
 FLASH_STATES = ("neutral", "anger")
@@ -76,11 +74,15 @@ GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernel
 
 @dataclass(slots=True)
 class DemoResults:
-    """Errors and tables of the demo's rigs."""
+    """Errors and tables of the demo's parts."""
 
     errors: list[list[Any]] = field(default_factory=list)
     """Subject, map, error, unit, coverage in %, masked fraction in %."""
     tables: list[dict[str, Any]] = field(default_factory=list)
+    double: "FusedDouble | None" = None
+    """Fused person, for the part that lights its face."""
+    unmeasured: "UnmeasuredParts | None" = None
+    """Parts of the head for the fused person."""
 
     def add(
         self, name: str, quantity: str, error: float, unit: str, coverage: float, masked: float
@@ -94,6 +96,8 @@ class DemoResults:
 
     def add_light(self, title: str, capture: SimulationResult) -> None:
         """Add a table of the light that a capture took."""
+        from skinrig.capturing.light_safety import light_rows
+
         self.add_table(title, ["quantity", "value"], light_rows(capture.light))
 
     def add_omissions(self, rig: str, capture: SimulationResult) -> None:
@@ -107,13 +111,16 @@ StepTimer = Callable[[str], AbstractContextManager[None]]
 
 @dataclass(frozen=True, slots=True)
 class RigDemo:
-    """Demo of one rig: output folder, seed, timer of steps, image width and results."""
+    """Part of the demo, such as one rig."""
 
     out: Path
     seed: int
     share: StepTimer
+    """Times a step."""
     width_px: int | None
-    found: DemoResults
+    before: Mapping[str, DemoResults]
+    """Results of the parts that this one needs, by name."""
+    found: DemoResults = field(default_factory=DemoResults)
 
     def simulate(self, rig: str, name: str, **options: Any) -> SimulationResult:
         """Simulate a capture into ``session-RIG-NAME``."""
@@ -121,6 +128,8 @@ class RigDemo:
 
     def calibrate(self, rig: str, kind: str, *targets: str, **options: Any) -> None:
         """Calibrate a rig from sessions of targets."""
+        from skinrig.calibrating.calibrate import calibrate
+
         sessions = [self.out / f"session-{rig}-{target}" for target in targets]
         calibrate(kind, sessions, self.out / f"calibration-{rig}", **options)
 
@@ -132,6 +141,9 @@ class RigDemo:
         hold_out: str | None = None,
     ) -> tuple[str, Path, SkinAppearance, SkinAppearance]:
         """Reconstruct a capture; return the maps' name and folder, the maps and ground truth."""
+        from reconstruction.pipeline import recipes as pipeline
+        from reconstruction.pipeline.inputs import DomeOptions
+
         folder = self.out / capture.session.name.replace("session", "appearance")
         pipeline.reconstruct(
             capture.session,
@@ -162,6 +174,9 @@ def choose_width(rig: str, width_px: int | None) -> int | None:
 
 def _flash(run: RigDemo) -> None:
     """Run the flash rig on targets and a face, up to melanin, blood volume and its changes."""
+    from skinrig.evaluating import flash
+    from skinrig.fitting.facial_color import fit_facial_color
+
     found, width = run.found, run.width_px
     with run.share("flash: capture the calibration targets"):
         for target in FLASH_CALIBRATIONS:
@@ -193,6 +208,10 @@ def _flash(run: RigDemo) -> None:
 
 
 def _evaluate_states(appearance: Path, found: DemoResults) -> None:
+    from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
+    from skinrig.applying.expression import read_hemoglobin_rig
+    from skinrig.evaluating import facial_color
+
     maps = store.read(appearance)
     named = describe_parts(maps)[FACIAL_COLOR]["truth"]
     truths = {state: store.read(appearance.parent / folder) for state, folder in named.items()}
@@ -208,7 +227,7 @@ def _evaluate_states(appearance: Path, found: DemoResults) -> None:
 def _dome(run: RigDemo) -> None:
     """Run the dome on targets and a face, up to normals, albedo and basis BRDFs."""
     from skinrig.evaluating import reflection
-    from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
+    from skinrig.evaluating import surface as surface_evaluation
 
     found = run.found
     width = choose_width("dome", run.width_px)
@@ -227,7 +246,7 @@ def _dome(run: RigDemo) -> None:
             width_px=width,
         )
     with run.share("dome: reconstruct normals, albedo and basis BRDFs"):
-        name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
+        name, _, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
         for row in surface_evaluation.compare(maps, truth, rng=np.random.default_rng(0)):
             found.add(
                 name, row.name, row.limit_check[1], row.unit, row.coverage.fraction, row.masked
@@ -236,26 +255,37 @@ def _dome(run: RigDemo) -> None:
         if held_out is not None:
             error = 100 * held_out.median
             found.add(name, "reflection, held out", error, "%", float("nan"), 0.0)
-    with run.share("dome: render held-out photographs"):
-        compared = evaluate_folders(
-            folder,
-            capture.session,
-            run.out / f"pictures-{name}",
-            EvaluationSettings(count=N_COMPARED_PHOTOGRAPHS, seed=run.seed),
-            calibration=run.out / "calibration-dome",
-        )
-    models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
-    found.add_table(
-        "Luminance of held-out photographs, on lit pixels",
-        ["model", "median error, %", "all skin, %"],
-        ([name, 100 * row["median"], 100 * row["total_error"]] for name, row in models.items()),
-    )
     found.add_light("Light of the dome's capture", capture)
     found.add_omissions("dome", capture)
 
 
+def _photographs(run: RigDemo) -> None:
+    """Render the dome's held-out photographs from its maps."""
+    from skinrig.rendering.photographs.errors import FULL_MODEL
+    from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
+
+    with run.share("dome: render held-out photographs"):
+        compared = evaluate_folders(
+            run.out / f"appearance-dome-{DEMO_SUBJECT}",
+            run.out / f"session-dome-{DEMO_SUBJECT}",
+            run.out / f"pictures-dome-{DEMO_SUBJECT}",
+            EvaluationSettings(count=N_COMPARED_PHOTOGRAPHS, seed=run.seed),
+            calibration=run.out / "calibration-dome",
+        )
+    models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
+    run.found.add_table(
+        "Luminance of held-out photographs, on lit pixels",
+        ["model", "median error, %", "all skin, %"],
+        ([name, 100 * row["median"], 100 * row["total_error"]] for name, row in models.items()),
+    )
+
+
 def _gradient(run: RigDemo) -> None:
     """Run the gradient sphere on a glass ball and stretched skin, up to kernels."""
+    from skinrig.evaluating import microrelief
+    from skinrig.fitting.microstructure import fit_microstructure
+    from skinrig.reporting.map_names import state_title
+
     found = run.found
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
@@ -286,6 +316,8 @@ def _gradient(run: RigDemo) -> None:
 
 def _probe(run: RigDemo) -> None:
     """Run the fiber probe on a phantom, a medium and three sites of a face."""
+    from skinrig.evaluating import subsurface
+
     with run.share("probe: capture a phantom"):
         run.simulate("probe", "phantom", target="phantom")
     with run.share("probe: calibrate its fibers"):
@@ -307,18 +339,31 @@ def _probe(run: RigDemo) -> None:
     run.found.add_omissions("fiber probe", captures[-1])
 
 
-def fuse_person(run: RigDemo, rigs: Sequence[str], errors: Sequence[list[Any]] = ()) -> None:
-    """Fuse the maps of one person by these rigs, and compare them with the best single rig.
+def _fit_head(run: RigDemo) -> None:
+    """Fit the mean head to the dome's mesh, which the fused person has, too."""
+    from skinrig.fusing.unmeasured import find_unmeasured
 
-    The finished face shows errors of the rigs' own maps, too.
-    """
+    with run.share("dome: fit the mean head"):
+        dome = store.read(run.out / f"appearance-dome-{DEMO_SUBJECT}")
+        run.found.unmeasured = find_unmeasured(dome)
+
+
+def _fuse_person(run: RigDemo) -> None:
+    """Fuse the maps of one person by all rigs, and compare them with the best single rig."""
     from skinrig.evaluating.fusion import compare_fused
     from skinrig.fusing.double import FusionInputs, fuse
-    from skinrig.fusing.finished_face import render_finished_face, write_finished_face
 
-    folders = {rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}" for rig in rigs}
+    folders = {
+        rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}"
+        for rig in RIGS
+        if rig in run.before
+    }
     with run.share("fuse the rigs' maps of the person"):
-        double = fuse(FusionInputs(tuple(folders.values())), out=run.out / DOUBLE_FOLDER)
+        double = fuse(
+            FusionInputs(tuple(folders.values())),
+            out=run.out / DOUBLE_FOLDER,
+            unmeasured=run.before[HEAD_PART].unmeasured,
+        )
     with run.share("compare the fused maps with each rig's"):
         single = {rig: store.read(folders[rig]) for rig in ("flash", "dome")}
         truths = {
@@ -336,6 +381,16 @@ def fuse_person(run: RigDemo, rigs: Sequence[str], errors: Sequence[list[Any]] =
     )
     named = double.contradiction or "none"
     run.found.add_table("Rig that contradicts the others", ["rig"], [[named]])
+    run.found.double = double
+
+
+def _light_face(run: RigDemo) -> None:
+    """Render the fused person's face, lit and moving, with errors of the maps that it shows."""
+    from skinrig.fusing.finished_face import render_finished_face, write_finished_face
+
+    double = run.before[PERSON_PART].double
+    if double is None:
+        raise ValueError(f"{PERSON_PART}: got no fused maps, expected those of its rigs")
     with run.share("light and move the finished face"):
         maps = run.out / DOUBLE_FOLDER, run.out / FLASH_MOVING_FOLDER
         moving = store.read(maps[1])
@@ -345,13 +400,15 @@ def fuse_person(run: RigDemo, rigs: Sequence[str], errors: Sequence[list[Any]] =
             face,
             double,
             moving,
-            errors=_list_errors_shown([*errors, *run.found.errors]),
+            errors=_list_errors_shown(row for one in run.before.values() for row in one.errors),
             folders=maps,
         )
 
 
 def _list_errors_shown(errors: Iterable[list[Any]]) -> dict[str, str]:
     """Return the errors of what the finished face shows, in words, by quantity."""
+    from skinrig.evaluating.facial_color import PREDICTION_METHODS
+
     by_name = {(row[0], row[1]): row[2] for row in errors}
     r_d = [e for (name, what), e in by_name.items() if (name, what[:4]) == (DOUBLE_FOLDER, "r_d ")]
     shown = {}
@@ -362,7 +419,7 @@ def _list_errors_shown(errors: Iterable[list[Any]]) -> dict[str, str]:
         (f"dome-{DEMO_SUBJECT}", "reflection, held out", "reflection in held-out light", " %"),
         (
             f"flash-moving-{DEMO_SUBJECT}",
-            f"blood of {FLASH_STATES[1]}, {facial_color.PREDICTION_METHODS[1]}",
+            f"blood of {FLASH_STATES[1]}, {PREDICTION_METHODS[1]}",
             f"blood volume fraction of {FLASH_STATES[1]}",
             " %",
         ),
@@ -372,10 +429,35 @@ def _list_errors_shown(errors: Iterable[list[Any]]) -> dict[str, str]:
     return shown
 
 
-RIGS: Mapping[str, Callable[[RigDemo], None]] = {
+PARTS: Mapping[str, Callable[[RigDemo], None]] = {
     "flash": _flash,
     "dome": _dome,
+    HEAD_PART: _fit_head,
+    PHOTOGRAPHS_PART: _photographs,
     "gradient": _gradient,
     "probe": _probe,
+    PERSON_PART: _fuse_person,
+    FACE_PART: _light_face,
 }
-"""Demo function of each rig, in the order of the report."""
+"""Function of each part of the demo, in the order of the report.
+
+Of the parts that need the dome alone, the person waits for the head, and so it begins first.
+"""
+
+
+def list_parts(rigs: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Return the parts of a demo of some rigs, in the order of the report, with what each needs.
+
+    Examples
+    --------
+    >>> list_parts(["dome", "flash"])["face"]
+    ('flash', 'dome', 'person')
+    """
+    asked = tuple(rig for rig in RIGS if rig in rigs)
+    needs: dict[str, tuple[str, ...]] = dict.fromkeys(asked, ())
+    if "dome" in asked:
+        needs[PHOTOGRAPHS_PART] = ("dome",)
+    if {"flash", "dome"} <= set(asked):  # maps of one person that can be fused
+        person = (*asked, HEAD_PART)
+        needs |= {HEAD_PART: ("dome",), PERSON_PART: person, FACE_PART: (*asked, PERSON_PART)}
+    return {part: needs[part] for part in PARTS if part in needs}

@@ -5,6 +5,7 @@ import io
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +93,7 @@ def to_data_url(file: bytes, kind: str = "png") -> str:
     return f"data:image/{kind};base64," + base64.b64encode(file).decode("ascii")
 
 
+@lru_cache(maxsize=64)  # a report repeats images of its first screen, and of earlier ones
 def to_webp_url(file: bytes) -> str:
     """Encode an image file without loss as WebP, a fifth smaller than PNG, in a ``data:`` URL."""
     from PIL import Image

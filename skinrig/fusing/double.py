@@ -36,7 +36,7 @@ from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
 from skinrig.fusing.sources import FusionInputError, Source, Sources, read_sources
 from skinrig.fusing.texel_colors import ColorSource, DomeColors, FlashColors
-from skinrig.fusing.unmeasured import UNMEASURED_NAME, add_unmeasured
+from skinrig.fusing.unmeasured import UNMEASURED_NAME, UnmeasuredParts, add_unmeasured
 from skinrig.fusing.wrinkles import carry_wrinkles
 
 QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
@@ -128,7 +128,11 @@ class FusedDouble:
 
 
 def fuse(
-    given: FusionInputs, *, out: Path, progress: Callable[[str], None] | None = None
+    given: FusionInputs,
+    *,
+    out: Path,
+    progress: Callable[[str], None] | None = None,
+    unmeasured: UnmeasuredParts | None = None,
 ) -> FusedDouble:
     """Fuse one person's maps and write them as one appearance.
 
@@ -140,6 +144,8 @@ def fuse(
         Folder to write.
     progress
         Receives a line of progress.
+    unmeasured
+        Parts for display, fitted to the dome's mesh before; None: they are fitted here.
 
     Raises
     ------
@@ -154,7 +160,9 @@ def fuse(
     dome = sources.get("dome")
     if dome is not None and not {UNMEASURED_NAME, "dome"} & set(given.without):
         report = progress or (lambda _step: None)
-        whole = add_unmeasured(found.appearance, dome.path, given.landmarks, progress=report)
+        whole = add_unmeasured(
+            found.appearance, dome.path, given.landmarks, progress=report, found=unmeasured
+        )
         undrawn = whole.left_out[len(found.appearance.left_out) :]
         found = replace(found, appearance=whole, undrawn=undrawn)
     store.write(out, found.appearance)

@@ -1,7 +1,7 @@
 """Add parts that no rig measures to a fused person, marked as such."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +22,45 @@ UNMEASURED_SOURCE: Final = (
     "not measured; for display, the mean of simulated heads, fitted to the scan"
 )
 """End of what an appearance with such parts assumes."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnmeasuredParts:
+    """Parts that no rig measures, for an appearance with the same mesh.
+
+    Attributes
+    ----------
+    files
+        The fitted head; none if it adds no part.
+    described
+        Parts, source and errors, as JSON values.
+    left_out
+        Parts that cannot be added, with reasons.
+    """
+
+    files: Mapping[str, bytes]
+    described: Mapping[str, Any]
+    left_out: tuple[tuple[str, str], ...]
+
+
+def find_unmeasured(
+    appearance: SkinAppearance, landmarks_mm: Mapping[str, tuple[float, float, float]] | None = None
+) -> UnmeasuredParts:
+    """Fit the mean head to the mesh of an appearance; a mesh without a face has no parts.
+
+    Parameters
+    ----------
+    appearance
+        With the mesh of its maps.
+    landmarks_mm
+        Points of the mesh by name that guide the fit.
+    """
+    try:
+        files, described, missing = fit_unmeasured(appearance, landmarks_mm)
+    except (HeadFitError, ScanMeshError, MeshError, GeometryError) as error:
+        return UnmeasuredParts({}, {}, ((UNMEASURED_ROW, str(error)),))
+    rows = tuple((f"{UNMEASURED_ROW}: {what}", why) for what, why in missing)
+    return UnmeasuredParts(files, described, rows)
 
 
 def drop_unmeasured(appearance: SkinAppearance) -> SkinAppearance:
@@ -52,6 +91,7 @@ def add_unmeasured(
     landmarks: Path | None,
     *,
     progress: Callable[[str], None],
+    found: UnmeasuredParts | None = None,
 ) -> SkinAppearance:
     """Return an appearance with the mean head fitted to its mesh, in a file of its own.
 
@@ -69,26 +109,25 @@ def add_unmeasured(
         truth is not used.
     progress
         Receives a line of progress.
+    found
+        Parts for this mesh; None: they are fitted here.
     """
     if not any(name in appearance.files for name in MESH_FILES):
         return appearance
-    progress("fit the mean head, for parts that no rig measured")
-    points = None if landmarks is None else face_textures.read(dome, landmarks).landmarks
-    try:
-        files, described, missing = fit_unmeasured(appearance, points)
-    except (HeadFitError, ScanMeshError, MeshError, GeometryError) as error:
-        return replace(appearance, left_out=(*appearance.left_out, (UNMEASURED_ROW, str(error))))
-    rows = [(f"{UNMEASURED_ROW}: {what}", why) for what, why in missing]
-    appearance = replace(appearance, left_out=(*appearance.left_out, *rows))
-    if not files:
+    if found is None:
+        progress("fit the mean head, for parts that no rig measured")
+        points = None if landmarks is None else face_textures.read(dome, landmarks).landmarks
+        found = find_unmeasured(appearance, points)
+    appearance = replace(appearance, left_out=(*appearance.left_out, *found.left_out))
+    if not found.files:
         return appearance
-    assumed = f"{', '.join(described['parts'])}: {UNMEASURED_SOURCE}"
+    assumed = f"{', '.join(found.described['parts'])}: {UNMEASURED_SOURCE}"
     return replace(
         appearance,
-        files={**appearance.files, **files},
+        files={**appearance.files, **found.files},
         parameters={
             **appearance.parameters,
             "assumed": [*list_assumptions(appearance), assumed],
-            UNMEASURED_KEY: described,
+            UNMEASURED_KEY: found.described,
         },
     )

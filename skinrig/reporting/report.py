@@ -207,7 +207,7 @@ def _build_sections(
         ),
         *chromophore.draw_identifiability(appearances.values()),
         *subsurface.compare_people(appearances, found.truths),
-        *_documents(found, checks),
+        *_documents(found, checks, drawn),
         *calibration.section(found.calibrations, appearances, sessions, checks),
         *session.list_omissions(found.sessions),
         *provenance.consent_section([found]),
@@ -253,11 +253,15 @@ def _name_truths(appearance: SkinAppearance, found: ReportInputs) -> list[Path]:
     return [found.truths[name] for name in names if name in found.truths]
 
 
-def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.Block]:
+def _documents(
+    found: ReportInputs, checks: list[page.Check], drawn: DrawnSections | None = None
+) -> Iterator[page.Block]:
+    drawn = DrawnSections() if drawn is None else drawn
     for path in found.documents:
         document = read_json(path)
         if bench.is_bench(document):
-            yield from bench.section(document, checks)
+            contents = path.name, hash_file(path)
+            yield from drawn.draw(contents, partial(bench.section, document), checks)
         elif document["schema"] == extremes.SCHEMA:
             yield from extremes.section(document, checks)
         elif study.is_study(document):

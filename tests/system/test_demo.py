@@ -12,7 +12,7 @@ from model import store
 from skinrig import demo
 from skinrig.cli import main
 from skinrig.console import Console
-from skinrig.demo import RIGS, DemoError, run_demo
+from skinrig.demo import PARTS, DemoError, run_demo
 from skinrig.simulating.orders import SimulationError
 from skinrig.viewer.faces import build_scene
 
@@ -22,7 +22,7 @@ MAX_REPORT_BYTES = 3_000_000
 @pytest.fixture
 def without_benchmarks(monkeypatch):
     """Benchmarks have tests of their own, and take as long as they are allowed to."""
-    monkeypatch.setattr("skinrig.demo.run_stages", lambda *_, **__: {"passed": True})
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", lambda *_, **__: {"passed": True})
 
 
 @pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])
@@ -46,18 +46,16 @@ def test_folder_not_from_demo_is_left_unchanged(tmp_path):
 
 def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmarks):
     ran = []
-    for rig in list(RIGS):
-        monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
+    for part in list(PARTS):
+        monkeypatch.setitem(
+            PARTS, part, lambda run, part=part: ran.append(" ".join([part, *run.before]))
+        )
     monkeypatch.setattr("skinrig.reporting.report.build", lambda *_, **__: "<html></html>")
-
-    def fuse(run, rigs, errors):
-        ran.append(f"fuse {rigs}")
-
-    monkeypatch.setattr("skinrig.demo.fuse_person", fuse)
+    person = ["person flash dome head", "face flash dome person"]
     for asked, expected in (
-        (["dome"], ["dome"]),
+        (["dome"], ["dome", "photographs dome"]),
         (["flash"], ["flash"]),
-        (["dome", "flash"], ["flash", "dome", "fuse ['flash', 'dome']"]),
+        (["dome", "flash"], ["flash", "dome", "head dome", "photographs dome", *person]),
     ):
         ran.clear()
         run_demo(tmp_path / "demo", asked, console=Console(False), jobs=1)
@@ -66,9 +64,15 @@ def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmar
 
 def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchmarks):
     """Those before the last have what is done alone, and browsers load them again."""
-    for rig in ("flash", "dome"):
-        made = tmp_path / "demo" / f"session-{rig}-white"
-        monkeypatch.setitem(RIGS, rig, lambda *_, made=made: made.mkdir())
+    for part, folder in (
+        ("flash", "session-flash-white"),
+        ("dome", "session-dome-white"),
+        ("photographs", ".pictures-dome-III.part"),
+        ("person", "double"),
+        ("face", "finished-face"),
+    ):
+        made = tmp_path / "demo" / folder
+        monkeypatch.setitem(PARTS, part, lambda *_, made=made: made.mkdir())
     built, kept = [], []
 
     def build(paths, *, title, reload_s, folder, drawn):
@@ -77,7 +81,6 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
         return f"report {len(built)}"
 
     monkeypatch.setattr("skinrig.reporting.report.build", build)
-    monkeypatch.setattr("skinrig.demo.fuse_person", lambda *_: None)
     run_demo(tmp_path / "demo", ["dome", "flash"], console=Console(False), jobs=1)
     assert built == [
         (["session-flash-white", "demo.json"], "skinrig demo: flash; other rigs follow", 10),
@@ -86,10 +89,15 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
             "skinrig demo: flash, dome; the fused person follows",
             10,
         ),
+        (
+            ["double", "session-dome-white", "session-flash-white", "demo.json"],
+            "skinrig demo: flash, dome; the finished face follows",
+            10,
+        ),
         (["demo"], "skinrig demo", None),
     ]
     assert all(drawn is kept[0] for drawn in kept)
-    assert (tmp_path / "demo" / "report.html").read_text() == "report 3"
+    assert (tmp_path / "demo" / "report.html").read_text() == "report 4"
 
 
 def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
@@ -99,16 +107,18 @@ def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
 
 
 @pytest.mark.long
-def test_fusion_in_process_follows_all_rigs(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "_run_rig", small_demo.run_empty_rig)
-    monkeypatch.setattr(demo, "_fuse_rigs", small_demo.fuse_marks)
-    parts = list(demo._run_in_processes(["flash", "dome"], (tmp_path,), 2))
-    assert {name for name, _ in parts[:2]} == {"flash", "dome"}
-    assert parts[2][0] == demo.PERSON_PART
-    marks = ["session-dome-white", "session-flash-white"]
-    assert parts[2][1][0].errors == [[("flash", "dome"), [["flash"], ["dome"]], marks]]
+def test_parts_in_processes_follow_their_needs(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "_run_part", small_demo.run_empty_part)
+    needs = demo.list_parts(["flash", "dome"])
+    parts = dict(demo._run_in_processes(needs, (tmp_path,), 2))
+    assert parts.keys() == needs.keys()
+    for name, (found, _) in parts.items():
+        ((own, before, marks),) = found.errors
+        assert own == name
+        assert tuple(before) == needs[name]
+        assert {*before} <= {*marks}
     with pytest.raises(DemoError, match="no probe"):
-        list(demo._run_in_processes(["gradient", "probe"], (tmp_path,), 2))
+        list(demo._run_in_processes({"gradient": (), "probe": ()}, (tmp_path,), 2))
     assert not multiprocessing.active_children()
 
 
@@ -116,9 +126,10 @@ def test_fusion_in_process_follows_all_rigs(tmp_path, monkeypatch):
 def test_parallel_rig_threads_sleep_unless_user_sets_policy(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
-    monkeypatch.setattr(demo, "_run_rig", os.getenv)  # a process says what it was given
+    monkeypatch.setattr(demo, "_run_part", small_demo.get_setting)
     names = ["OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"]
-    given = dict(demo._run_in_processes(names, ("not set",), 1))
+    found = demo._run_in_processes(dict.fromkeys(names, ()), ("not set",), 1)
+    given = {name: value for name, (value, _) in found}
     assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "3"}
     assert [os.environ.get(name) for name in names] == [None, "3"]
 
@@ -127,7 +138,7 @@ def test_parallel_rig_threads_sleep_unless_user_sets_policy(monkeypatch):
 @pytest.mark.timeout(600)
 def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, without_benchmarks):
     # fewer lights and cameras than the demo's own: how accurate a dome is, other tests say
-    monkeypatch.setattr(demo, "_run_rig", small_demo.run_small_rig)
+    monkeypatch.setattr(demo, "_run_part", small_demo.run_small_part)
     out = tmp_path / "demo"
     document = run_demo(out, ["flash", "dome"], console=Console(True), width_px=200, jobs=2)
     assert len(Session.open(out / "session-dome-III").rig.views) == 4
