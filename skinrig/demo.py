@@ -74,13 +74,6 @@ TYPICAL_SECONDS = {
 
 They lie between those with and without compiled kernels.
 """
-FOLLOWING = {
-    **dict.fromkeys(RIGS, "other rigs follow"),
-    PERSON_PART: "the fused person follows",
-    PHOTOGRAPHS_PART: "held-out photographs follow",
-    FACE_PART: "the finished face follows",
-}
-"""End of the title of a preliminary report, by the first of these parts that it lacks."""
 REPORT_NAME = "report.html"
 MARK_NAME = ".skinrig-demo"
 """File that marks the folder of a demo."""
@@ -130,31 +123,25 @@ def run_demo(
     _make_room(out)
     began = time.perf_counter()
     parts: _Parts = {}
-    needs = list_parts(asked)
-    write_report = partial(_write_report, out, drawn=_keep_sections())
-    own: SecondsByStep = {}
+    needs, own = list_parts(asked), SecondsByStep()
+    drawn: DrawnSections | None = None
     for name, part in _run_parts(needs, (out, seed, width_px, console), at_once):
         parts[name] = part
+        drawn = drawn or _keep_sections()
         waiting = [one for one in needs if one not in parts]
         if waiting and name in (*asked, PERSON_PART):
-            write_report(parts, _sum_up(needs, parts), waiting=waiting)
+            _write_report(out, parts, _sum_up(needs, parts), waiting=waiting, drawn=drawn)
             console.print_line(
                 f"{name}: done, {len(parts.keys() & asked)} of {len(asked)} rigs, "
                 f"about {_estimate_left_s(parts, waiting, at_once):.0f} s left; "
                 f"the report so far: {out / REPORT_NAME}"
             )
         if name in asked and parts.keys() >= {*asked}:  # while the person is fused
-            from skinrig.benchmarks.stages import run_stages  # slow to import
-
-            quiet = replace(console, quiet=True)  # the report shows its tables
-            with _time_step("measure error against run time", own, console):
-                bench = run_stages(
-                    BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet
-                )
+            bench_passed = _measure_stages(out, own, console)
     found, shares = _sum_up(needs, parts)
     shares |= own
     with _time_step("report", shares, console):
-        write_report(parts, (found, shares), waiting=())
+        _write_report(out, parts, (found, shares), waiting=(), drawn=drawn)
     console.print_line("")
     console.print_table(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
@@ -166,8 +153,8 @@ def run_demo(
         for rig in asked
     ]
     console.print_table(("step", "seconds"), [*shares.items(), *by_rig])
-    parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
     total_s = time.perf_counter() - began
+    parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
     console.print_line(f"\ntotal: {total_s:.1f} s{parallel}")
     for step in suggest(scan(out), out):
         console.print_line(f"next: {step.command}  ({step.why})")
@@ -176,7 +163,7 @@ def run_demo(
         "seconds": shares,
         "total_s": total_s,
         "errors": found.errors,
-        "bench_passed": bench["passed"],
+        "bench_passed": bench_passed,
         "report": out / REPORT_NAME,
     }
 
@@ -215,6 +202,16 @@ def _sum_up(needs: Iterable[str], parts: _Parts) -> _Part:
     return found, shares
 
 
+def _measure_stages(out: Path, seconds: SecondsByStep, console: Console) -> bool:
+    """Measure the benchmark's stages into ``out``; return whether they kept their limits."""
+    from skinrig.benchmarks.stages import run_stages
+
+    quiet = replace(console, quiet=True)  # the report shows its tables
+    with _time_step("measure error against run time", seconds, console):
+        found = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
+    return bool(found["passed"])
+
+
 def _keep_sections() -> "DrawnSections":
     """Return an empty store of sections; reports are imported while the rigs run."""
     from skinrig.reporting.drawn_sections import DrawnSections
@@ -228,7 +225,7 @@ def _write_report(
     results: _Part,
     *,
     waiting: Sequence[str],
-    drawn: "DrawnSections",
+    drawn: "DrawnSections | None",
 ) -> None:
     """Write the demo's document and its report on what is done; preliminary if parts wait."""
     from skinrig.reporting.report import build
@@ -252,8 +249,8 @@ def _write_report(
             if names & set(one.name.split("-")) and not one.name.startswith(".")
         ]
         paths += [one for one in (written, out / "bench.json") if one.exists()]
-        follows = next(text for part, text in FOLLOWING.items() if part in waiting)
-        title += f": {', '.join(rig for rig in RIGS if rig in done)}; {follows}"
+        title += f": {', '.join(rig for rig in RIGS if rig in done)}; "
+        title += f"to follow: {', '.join(waiting)}"
     reload_s = RELOAD_S if waiting else None
     html = build(paths, title=title, reload_s=reload_s, folder=out, drawn=drawn)
     write_atomically(out / REPORT_NAME, html)
@@ -339,9 +336,10 @@ class _Schedule:
         name = self._ended.get()
         return name, self._begun[name].result()
 
-    def _end(self, name: str, _: Future[_Part]) -> None:
-        with suppress(RuntimeError):  # the pool ended; `wait_for_next` raises this error
-            self.begin_ready()
+    def _end(self, name: str, future: Future[_Part]) -> None:
+        if _has_succeeded(future):
+            with suppress(RuntimeError):  # the pool ended; `wait_for_next` raises this error
+                self.begin_ready()
         self._ended.put(name)
 
 

@@ -41,7 +41,6 @@ from skinrig.demo_rigs import (
     DOME_WIDTH_PX,
     FLASH_CALIBRATIONS,
     PROBE_WANT,
-    DemoResults,
     RigDemo,
 )
 from skinrig.evaluating import subsurface, surface
@@ -79,7 +78,7 @@ def capture(folder: Path, skin_type: str, seed: int, tissue: str, sizes: Sizes) 
     def share(_step: str) -> Iterator[None]:
         yield
 
-    run = RigDemo(folder, seed, share, sizes.flash["width_px"], DemoResults())
+    run = RigDemo(folder, seed, share, sizes.flash["width_px"], {})
     plans = {
         "flash": (
             [(kind, (target,)) for target, kind in FLASH_CALIBRATIONS.items()],

@@ -67,6 +67,7 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
     for part, folder in (
         ("flash", "session-flash-white"),
         ("dome", "session-dome-white"),
+        ("head", ".head.part"),
         ("photographs", ".pictures-dome-III.part"),
         ("person", "double"),
         ("face", "finished-face"),
@@ -83,15 +84,19 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
     monkeypatch.setattr("skinrig.reporting.report.build", build)
     run_demo(tmp_path / "demo", ["dome", "flash"], console=Console(False), jobs=1)
     assert built == [
-        (["session-flash-white", "demo.json"], "skinrig demo: flash; other rigs follow", 10),
+        (
+            ["session-flash-white", "demo.json"],
+            "skinrig demo: flash; to follow: dome, head, photographs, person, face",
+            10,
+        ),
         (
             ["session-dome-white", "session-flash-white", "demo.json"],
-            "skinrig demo: flash, dome; the fused person follows",
+            "skinrig demo: flash, dome; to follow: head, photographs, person, face",
             10,
         ),
         (
             ["double", "session-dome-white", "session-flash-white", "demo.json"],
-            "skinrig demo: flash, dome; the finished face follows",
+            "skinrig demo: flash, dome; to follow: face",
             10,
         ),
         (["demo"], "skinrig demo", None),

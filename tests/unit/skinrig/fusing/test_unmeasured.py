@@ -16,7 +16,12 @@ from rigsim.geometry.mesh import build_mesh
 from skinrig.cli import main
 from skinrig.fusing.double import FusionInputs, fuse, fuse_sources
 from skinrig.fusing.sources import read_sources
-from skinrig.fusing.unmeasured import UNMEASURED_NAME, UNMEASURED_SOURCE, add_unmeasured
+from skinrig.fusing.unmeasured import (
+    UNMEASURED_NAME,
+    UNMEASURED_SOURCE,
+    add_unmeasured,
+    find_unmeasured,
+)
 from skinrig.unmeasured.person import HEAD_FILE, UNMEASURED_KEY
 
 SIDE = 12
@@ -57,6 +62,8 @@ def test_option_leaves_equal_bytes_and_default_adds_file(tmp_path):
     assert found.parameters[UNMEASURED_KEY]["measured"] is False
     assert sum(one.endswith(UNMEASURED_SOURCE) for one in found.parameters["assumed"]) == 1
     assert {"eyes", "hair", "crown", "neck"} <= set(found.parameters[UNMEASURED_KEY]["parts"])
+    fuse(given, out=tmp_path / "ahead", unmeasured=find_unmeasured(store.read(dome)))
+    assert _content(tmp_path / "ahead") == more
 
 
 @pytest.mark.long
@@ -122,3 +129,6 @@ def test_mesh_without_face_is_reported(tmp_path):
     found = add_unmeasured(given, tmp_path, None, progress=lambda _: None)
     assert HEAD_FILE not in found.files
     assert "expected a face" in dict(found.left_out)["unmeasured parts"]
+    ahead = find_unmeasured(given)
+    again = add_unmeasured(given, tmp_path, None, progress=lambda _: None, found=ahead)
+    assert again.left_out == found.left_out

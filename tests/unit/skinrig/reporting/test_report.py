@@ -60,6 +60,7 @@ def test_sections_of_unchanged_maps_are_not_redrawn(folder, monkeypatch):
     first = report.build([folder], drawn=drawn)
     with monkeypatch.context() as patch:
         patch.setattr(report.chromophore, "draw_panels", None)  # drawing would raise
+        patch.setattr(report.bench.bench_figures, "plot_error_against_time", None)
         assert report.build([folder], drawn=drawn) == first == report.build([folder], drawn=drawn)
 
 
