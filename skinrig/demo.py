@@ -28,10 +28,10 @@ from skinrig.demo_rigs import (
     DOUBLE_FOLDER,
     FACE_PART,
     HEAD_PART,
-    PARTS,
     PERSON_PART,
     PHOTOGRAPHS_PART,
     RIGS,
+    RUN_BY_PART,
     DemoResults,
     RigDemo,
     choose_width,
@@ -410,7 +410,7 @@ def _run_part(
     with beat_while_running():
         timer = partial(_time_step, seconds=shares, console=console)
         run = RigDemo(out, seed, timer, width_px, before)
-        PARTS[name](run)
+        RUN_BY_PART[name](run)
     return run.found, shares
 
 

@@ -8,19 +8,15 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
+from skinrig.capturing.light_safety import light_rows
 from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
-
-if TYPE_CHECKING:
-    from skinrig.calibrating.gradient import GradientSurveys
-    from skinrig.fusing.double import FusedDouble
-    from skinrig.fusing.unmeasured import UnmeasuredParts
 
 RIGS = ("flash", "dome", "gradient", "probe")
 HEAD_PART = "head"
@@ -79,10 +75,8 @@ class DemoResults:
     errors: list[list[Any]] = field(default_factory=list)
     """Subject, map, error, unit, coverage in %, masked fraction in %."""
     tables: list[dict[str, Any]] = field(default_factory=list)
-    double: "FusedDouble | None" = None
-    """Fused person, for the part that lights its face."""
-    unmeasured: "UnmeasuredParts | None" = None
-    """Parts of the head for the fused person."""
+    made: Any = None
+    """What a part that needs this one takes over: the fitted head, or the fused person."""
 
     def add(
         self, name: str, quantity: str, error: float, unit: str, coverage: float, masked: float
@@ -96,8 +90,6 @@ class DemoResults:
 
     def add_light(self, title: str, capture: SimulationResult) -> None:
         """Add a table of the light that a capture took."""
-        from skinrig.capturing.light_safety import light_rows
-
         self.add_table(title, ["quantity", "value"], light_rows(capture.light))
 
     def add_omissions(self, rig: str, capture: SimulationResult) -> None:
@@ -290,7 +282,7 @@ def _gradient(run: RigDemo) -> None:
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
     with run.share("gradient: calibrate lights and polarizers"):
-        surveys: GradientSurveys = {}
+        surveys: dict[str, Any] = {}
         for kind in ("lights", "polarization"):
             run.calibrate("gradient", kind, "ball", surveys=surveys)
     with run.share("gradient: stretch and capture a patch of skin"):
@@ -345,7 +337,7 @@ def _fit_head(run: RigDemo) -> None:
 
     with run.share("dome: fit the mean head"):
         dome = store.read(run.out / f"appearance-dome-{DEMO_SUBJECT}")
-        run.found.unmeasured = find_unmeasured(dome)
+        run.found.made = find_unmeasured(dome)
 
 
 def _fuse_person(run: RigDemo) -> None:
@@ -353,16 +345,13 @@ def _fuse_person(run: RigDemo) -> None:
     from skinrig.evaluating.fusion import compare_fused
     from skinrig.fusing.double import FusionInputs, fuse
 
-    folders = {
-        rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}"
-        for rig in RIGS
-        if rig in run.before
-    }
+    rigs = [rig for rig in RIGS if rig in run.before]
+    folders = {rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}" for rig in rigs}
     with run.share("fuse the rigs' maps of the person"):
         double = fuse(
             FusionInputs(tuple(folders.values())),
             out=run.out / DOUBLE_FOLDER,
-            unmeasured=run.before[HEAD_PART].unmeasured,
+            unmeasured=run.before[HEAD_PART].made,
         )
     with run.share("compare the fused maps with each rig's"):
         single = {rig: store.read(folders[rig]) for rig in ("flash", "dome")}
@@ -381,16 +370,14 @@ def _fuse_person(run: RigDemo) -> None:
     )
     named = double.contradiction or "none"
     run.found.add_table("Rig that contradicts the others", ["rig"], [[named]])
-    run.found.double = double
+    run.found.made = double
 
 
 def _light_face(run: RigDemo) -> None:
     """Render the fused person's face, lit and moving, with errors of the maps that it shows."""
     from skinrig.fusing.finished_face import render_finished_face, write_finished_face
 
-    double = run.before[PERSON_PART].double
-    if double is None:
-        raise ValueError(f"{PERSON_PART}: got no fused maps, expected those of its rigs")
+    double = run.before[PERSON_PART].made
     with run.share("light and move the finished face"):
         maps = run.out / DOUBLE_FOLDER, run.out / FLASH_MOVING_FOLDER
         moving = store.read(maps[1])
@@ -429,7 +416,7 @@ def _list_errors_shown(errors: Iterable[list[Any]]) -> dict[str, str]:
     return shown
 
 
-PARTS: Mapping[str, Callable[[RigDemo], None]] = {
+RUN_BY_PART: Mapping[str, Callable[[RigDemo], None]] = {
     "flash": _flash,
     "dome": _dome,
     HEAD_PART: _fit_head,
@@ -439,10 +426,7 @@ PARTS: Mapping[str, Callable[[RigDemo], None]] = {
     PERSON_PART: _fuse_person,
     FACE_PART: _light_face,
 }
-"""Function of each part of the demo, in the order of the report.
-
-Of the parts that need the dome alone, the person waits for the head, and so it begins first.
-"""
+"""Function of each part of the demo, in the order of the report and of the start."""
 
 
 def list_parts(rigs: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -460,4 +444,4 @@ def list_parts(rigs: Iterable[str]) -> dict[str, tuple[str, ...]]:
     if {"flash", "dome"} <= set(asked):  # maps of one person that can be fused
         person = (*asked, HEAD_PART)
         needs |= {HEAD_PART: ("dome",), PERSON_PART: person, FACE_PART: (*asked, PERSON_PART)}
-    return {part: needs[part] for part in PARTS if part in needs}
+    return {part: needs[part] for part in RUN_BY_PART if part in needs}

@@ -129,14 +129,14 @@ def record() -> None:
     with event.install_listener("numba:compile", recorder), tempfile.TemporaryDirectory() as out:
         from skinrig.console import Console  # imported here: some kernels are compiled on import
         from skinrig.demo import run_demo
-        from skinrig.demo_rigs import PARTS, RigDemo
+        from skinrig.demo_rigs import RUN_BY_PART, RigDemo
 
         def run_recorded(run: RigDemo, rig: str, run_rig: Callable[[RigDemo], None]) -> None:
             recorder.rig = rig
             run_rig(run)
 
-        recorded = {rig: partial(run_recorded, rig=rig, run_rig=PARTS[rig]) for rig in ORDER}
-        cast(dict[str, Callable[[RigDemo], None]], PARTS).update(recorded)
+        recorded = {rig: partial(run_recorded, rig=rig, run_rig=RUN_BY_PART[rig]) for rig in ORDER}
+        cast(dict[str, Callable[[RigDemo], None]], RUN_BY_PART).update(recorded)
         run_demo(Path(out) / "demo", list(ORDER), console=Console(False), jobs=1)
     rows = []
     for rig, function, seconds, given in recorder.found:  # all modules are fully imported by now

@@ -12,7 +12,7 @@ from model import store
 from skinrig import demo
 from skinrig.cli import main
 from skinrig.console import Console
-from skinrig.demo import PARTS, DemoError, run_demo
+from skinrig.demo import RUN_BY_PART, DemoError, run_demo
 from skinrig.simulating.orders import SimulationError
 from skinrig.viewer.faces import build_scene
 
@@ -46,9 +46,9 @@ def test_folder_not_from_demo_is_left_unchanged(tmp_path):
 
 def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmarks):
     ran = []
-    for part in list(PARTS):
+    for part in list(RUN_BY_PART):
         monkeypatch.setitem(
-            PARTS, part, lambda run, part=part: ran.append(" ".join([part, *run.before]))
+            RUN_BY_PART, part, lambda run, part=part: ran.append(" ".join([part, *run.before]))
         )
     monkeypatch.setattr("skinrig.reporting.report.build", lambda *_, **__: "<html></html>")
     person = ["person flash dome head", "face flash dome person"]
@@ -73,7 +73,7 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
         ("face", "finished-face"),
     ):
         made = tmp_path / "demo" / folder
-        monkeypatch.setitem(PARTS, part, lambda *_, made=made: made.mkdir())
+        monkeypatch.setitem(RUN_BY_PART, part, lambda *_, made=made: made.mkdir())
     built, kept = [], []
 
     def build(paths, *, title, reload_s, folder, drawn):
