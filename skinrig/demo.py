@@ -65,7 +65,7 @@ BENCH_STAGES = (
     "normal-histogram",
 )
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
-BENCH_BUDGET_S = 8.0
+BENCH_BUDGET_S = 20.0
 TYPICAL_SECONDS = {
     **{"flash": 45.0, "dome": 100.0, PHOTOGRAPHS_PART: 10.0, "gradient": 60.0, "probe": 30.0},
     **{HEAD_PART: 5.0, PERSON_PART: 7.0, FACE_PART: 6.0},
