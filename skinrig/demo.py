@@ -153,8 +153,8 @@ def run_demo(
         for rig in asked
     ]
     console.print_table(("step", "seconds"), [*shares.items(), *by_rig])
-    total_s = time.perf_counter() - began
     parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
+    total_s = time.perf_counter() - began
     console.print_line(f"\ntotal: {total_s:.1f} s{parallel}")
     for step in suggest(scan(out), out):
         console.print_line(f"next: {step.command}  ({step.why})")
