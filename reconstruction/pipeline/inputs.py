@@ -273,7 +273,7 @@ def _digest_of(folder: Path) -> str:
     """Hash a folder's tables, names and contents."""
     if not folder.is_dir():
         got = f"got {folder}, expected a folder"
-        raise InputsError(f"basis: {got}; give one with .binary or .bsdf files")
+        raise InputsError(f"--merl-basis: {got}; give one with .binary or .bsdf files")
     digest = hashlib.sha256()
     for path in list_material_files(folder):
         digest.update(path.name.encode() + b"\0")

@@ -75,7 +75,9 @@ def simulate_profile(length_mm: float, seed: int) -> tuple[Float64Array, float]:
     """
     low, high = LENGTH_LIMITS_MM
     if not low <= length_mm <= high:
-        raise UnusableError(f"--length: got {length_mm:g}, expected {low:g} to {high:g} mm")
+        raise UnusableError(
+            f"--length: got {length_mm:g}, expected {low:g} to {high:g} mm; change it"
+        )
     skin = make_micro_skin("forehead", seed=seed, size_mm=length_mm, texel_um=SIMULATED_SPACING_UM)
     middle = skin.height_um[skin.height_um.shape[0] // 2]
     return middle.astype(np.float64), skin.texel_um
@@ -118,7 +120,9 @@ def analyze_profile(
     drawn = []
     for stretch in stretches:
         if not low <= stretch <= high:
-            raise UnusableError(f"--stretch: got {stretch:g}, expected {low:g} to {high:g}")
+            raise UnusableError(
+                f"--stretch: got {stretch:g}, expected {low:g} to {high:g}; change it"
+            )
         alpha, sigma_um = (float(value) for value in kernel_parameters(stretch, FOREHEAD))
         how = {"spacing_um": spacing_um, "stretch": stretch, "sigma_um": sigma_um}
         table = length_change(height_um, alpha=alpha, **how)

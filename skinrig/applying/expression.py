@@ -12,7 +12,7 @@ import numpy as np
 from model import color_table, store
 from model.color_table import ColorTable
 from model.color_table_file import read_color_table
-from model.facial_color import HemoglobinRig
+from model.facial_color import FacialColorError, HemoglobinRig
 from model.facial_color import rig as facial_color
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
@@ -135,7 +135,7 @@ def parse_weights(text: str) -> dict[str, float]:
     >>> parse_weights("smile=0.7, anger=0.3")
     {'smile': 0.7, 'anger': 0.3}
     """
-    found = parse_amounts(text.split(","), "weights", error=WeightsError)
+    found = parse_amounts(text.split(","), "--weights", error=WeightsError)
     for name, weight in found.items():
         if not np.isfinite(weight):
             raise WeightsError(
@@ -271,6 +271,10 @@ def _facial_color(
     if expression.target_face is not None:
         rig = _transfer_rig(rig, expression.target_face, done)
         maps = expression.target_face.appearance.maps
+    try:
+        rig.check_weights(expression.weights)
+    except FacialColorError as error:
+        raise FacialColorError(f"--{error}") from error  # weights are those of the option
     blend = rig.evaluate(
         expression.weights,
         gains=facial_color.GLOBAL_GAINS if expression.emotional else None,
@@ -377,7 +381,7 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
     found: dict[str, float] = {}
     for state, weight in weights.items():
         if state not in rows and state not in ROW_OF_STATE:
-            require_choice("weights", state, sorted(rows), ApplyError)
+            require_choice("--weights", state, sorted(rows), ApplyError)
         row = state if state in rows else ROW_OF_STATE[state]
         if row is not None and row not in rows:
             raise ApplyError(

@@ -296,8 +296,8 @@ def _with_states(
     unknown = [name for name in names if name not in mesh.shapes and name not in STATE_NAMES]
     if unknown:
         raise ApplyError(
-            f"weights: got {unknown[0]!r}, expected a state ({', '.join(STATE_NAMES)}) or a shape "
-            f"of the mesh ({', '.join(mesh.shapes) or 'it has none'})"
+            f"--weights: got {unknown[0]!r}, expected a state ({', '.join(STATE_NAMES)}) or a "
+            f"shape of the mesh ({', '.join(mesh.shapes) or 'it has none'}); name one of them"
         )
     missing = [name for name in names if name not in own and is_moving_state(name)]
     if not missing:

@@ -172,7 +172,7 @@ def fit_tables(
         if folder is not None:
             where = str(folder)
             remedy = "add MERL .binary or RGL .bsdf files, or omit the folder"
-        raise UnusableError(f"{where}: got {total}, expected {MIN_TABLES} or more tables; {remedy}")
+        raise UnusableError(f"{where}: got {total} tables, expected {MIN_TABLES} or more; {remedy}")
     report = progress or (lambda text: None)
     rng = np.random.default_rng([seed, 2])
     light, view = (_draw_directions(rng, 2 * N_SAMPLES) for _ in range(2))

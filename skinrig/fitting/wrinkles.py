@@ -99,7 +99,7 @@ def fit_wrinkles(
     if "neutral" not in read or len(read) < 2:
         raise WrinkleInputError(
             f"appearances: got {', '.join(read) or 'none'}, expected neutral and at least one"
-            f" expression"
+            " expression; add folders, or name them as STATE=FOLDER"
         )
     unchecked = _check_textures({state: one for state, (_, one) in read.items()})
     measured = {state: _normals(folder, one) for state, (folder, one) in read.items()}

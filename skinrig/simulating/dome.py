@@ -409,7 +409,9 @@ def _skin_light_effects(order: DomeOrder) -> dict[str, Any]:
     without = order.scene_switches()
     for name in without:
         if requested.get(name):
-            raise SimulationOptionsError(f"leave_out: {name} is also requested; remove one of them")
+            raise SimulationOptionsError(
+                f"--omit (leave_out): {name} is also requested; remove one of them"
+            )
     return {**requested, **without}
 
 

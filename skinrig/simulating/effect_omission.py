@@ -66,7 +66,9 @@ def omission_arguments(rig: str, names: Sequence[str]) -> dict[str, bool]:
         own = next((k for k in known if k == name or {k, name} <= LATERAL_SWITCHES), None)
         if own is None:
             expected = f"one of {', '.join(known)}" if known else "none; remove the option"
-            raise ValueError(f"leave_out: got {name!r}, expected for the {rig} rig {expected}")
+            raise ValueError(
+                f"--omit (leave_out): got {name!r}, expected for the {rig} rig {expected}"
+            )
         out[own] = False
     return out
 

@@ -211,7 +211,7 @@ class SimulationOrder:
             return {}
         if self.exclusive_subject is not None:
             raise SimulationOptionsError(
-                f"leave_out: an option of skin at rest or with an expression, not of "
+                f"--omit (leave_out): an option of skin at rest or with an expression, not of "
                 f"{self.exclusive_subject}; remove it"
             )
         try:

@@ -82,7 +82,7 @@ def test_dark_rgl_file_is_named(tmp_path):
     rgl.write(tmp_path / "a.bsdf", dark)
     with pytest.raises(tables.BasisError, match=r"a\.bsdf: got no value above 0"):
         tables.load(tmp_path)
-    with pytest.raises(UnusableError, match=r"got 1, expected 3 or more tables; add MERL"):
+    with pytest.raises(UnusableError, match=r"got 1 tables, expected 3 or more; add MERL"):
         brdf_tables.fit_tables(tmp_path / "out", tmp_path, count=1, seed=0)
 
 
@@ -94,7 +94,7 @@ def test_table_bright_at_horizon_alone_is_named(tmp_path):
     with pytest.raises(UnusableError, match=r"a\.binary: got no value above 0 at angles away"):
         brdf_tables.fit_tables(tmp_path / "out", tmp_path, count=1, seed=0)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(UnusableError, match=r"^--count: got 2, expected 3 or more tables; enter"):
+    with pytest.raises(UnusableError, match=r"^--count: got 2 tables, expected 3 or more; enter"):
         brdf_tables.fit_tables(tmp_path / "out", None, count=2, seed=0)
 
 

@@ -35,7 +35,7 @@ def test_omitted_flash_effects_are_reported_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "more", "match"),
     [
-        ("flash", {"leave_out": ("shadow",)}, "'shadow', expected for the flash rig one of lat"),
+        ("flash", {"leave_out": ("shadow",)}, r"^--omit .*'shadow', expected for the flash rig"),
         ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
         ("probe", {"leave_out": ("optics",)}, "expected for the probe rig one of crosstalk"),
         ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface is also requested"),
