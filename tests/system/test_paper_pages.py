@@ -1,5 +1,7 @@
-"""Pages of the papers: each command parses, each item has a command or a reason."""
+"""Pages of the papers: commands parse, folders exist, each item has a command or a reason."""
 
+import ast
+import inspect
 import re
 import shlex
 from pathlib import Path
@@ -7,11 +9,16 @@ from pathlib import Path
 import pytest
 import typer
 
+from skinrig import demo_rigs
 from skinrig.cli import app
 from skinrig.command_line.help import RigGroup
 
 PAGES = sorted((Path(__file__).parents[2] / "docs/validation").glob("paper-*.md"))
 COMMAND = re.compile(r"`skinrig ([^`]+)`")
+FOLDER = re.compile(
+    r"\b(?:session|appearance|calibration|truth)-(?:flash|dome|gradient|probe)[\w-]*"
+)
+OUTPUT = re.compile(r"--out (\S+?)[\s`]")
 TREE = typer.main.get_command(app)
 
 
@@ -55,3 +62,40 @@ def test_paper_page_rows_have_command_or_reason(page):
 def test_paper_page_parser_refuses_unknown_option():
     with pytest.raises(Exception, match="No such option"):
         parse(shlex.split("analyse blood a --out b --nothing 3"))
+
+
+def list_demo_folders():
+    """Read the names of sessions, maps and ground truth from the calls of `skinrig.demo_rigs`."""
+    made = {demo_rigs.FLASH_MOVING_FOLDER, f"appearance-gradient-moving-{demo_rigs.GRADIENT_SITE}"}
+    made |= {
+        f"truth-flash-{demo_rigs.DEMO_SUBJECT}-{state}" for state in demo_rigs.FLASH_STATES[1:]
+    }
+    for rig, function in demo_rigs.RIGS.items():
+        nodes = list(ast.walk(ast.parse(inspect.getsource(function))))
+        loops = {ast.unparse(one.target): one.iter for one in nodes if isinstance(one, ast.For)}
+        # results of targets serve calibrations alone
+        targets = [one.value for one in nodes if isinstance(one, ast.Expr)]
+        made.add(f"calibration-{rig}")
+        for call in nodes:
+            if not isinstance(call, ast.Call) or ast.unparse(call.func) != "run.simulate":
+                continue
+            name = ast.unparse(call.args[1])
+            names = loops.get(name, ast.Tuple([call.args[1]], ast.Load()))
+            kinds = ["session"] if call in targets else ["session", "appearance", "truth"]
+            values = eval(ast.unparse(names), vars(demo_rigs))
+            made |= {f"{kind}-{rig}-{value}" for kind in kinds for value in values}
+    return made
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, PAGES[0].with_name("index.md")], ids=lambda page: page.stem
+)
+def test_paper_page_folders_are_made(page):
+    text = page.read_text("utf-8")
+    assert set(FOLDER.findall(text)) <= list_demo_folders() | set(OUTPUT.findall(text))
+
+
+def test_folders_of_no_demo_are_missing():
+    made = list_demo_folders()
+    assert {"session-flash-white", "session-dome-III", "truth-flash-III-anger"} <= made
+    assert not {"session-flash-II", "appearance-flash-white", "appearance-flash-moving-II"} & made
