@@ -54,12 +54,12 @@ class BusyError(ValueError):
 
 
 @cache
-def code_digest() -> str:
-    """Hash the code and data of the packages that determine a map, and the libraries' versions."""
+def code_digest(packages: Sequence[str] = PRODUCT_PACKAGES) -> str:
+    """Hash the code and data of packages, by default those of maps, and the libraries' versions."""
     digest = hashlib.sha256()
     for name, version in list_library_versions().items():
         digest.update(f"{name} {version}\0".encode())
-    for package in PRODUCT_PACKAGES:
+    for package in packages:
         root = Path(str(resources.files(package)))
         for path in sorted(root.rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts:

@@ -64,7 +64,8 @@ def bench(
         Rig whose errors of maps to measure against seconds from planning to maps: dome,
         flash, gradient or probe; default: none.
     out
-        Folder for bench.json, a table and plots, or for extremes.json; default: no files.
+        Folder for bench.json, whose finished stages are kept, a table and plots, or for
+        extremes.json; default: no files.
     more
         Stages to run, as with --stage; default: all.
     stage

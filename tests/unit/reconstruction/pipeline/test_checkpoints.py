@@ -141,11 +141,10 @@ def test_run_of_changed_code_takes_up_nothing(tmp_path, monkeypatch):
 def test_code_digest_changes_with_any_source(tmp_path, monkeypatch):
     (tmp_path / "one" / "data").mkdir(parents=True)
     monkeypatch.setattr(module.resources, "files", lambda package: tmp_path / package)
-    monkeypatch.setattr(module, "PRODUCT_PACKAGES", ("one",))
     found = set()
     for name, text in (("a.py", "1"), ("a.py", "2"), ("data/table.csv", "2"), ("b.py", "")):
         (tmp_path / "one" / name).write_text(text)
-        found.add(module.code_digest.__wrapped__())
+        found.add(module.code_digest.__wrapped__(("one",)))
     assert len(found) == 4
 
 
@@ -251,9 +250,8 @@ def test_lock_removed_while_opened_is_replaced(tmp_path, monkeypatch):
 
 
 def test_code_digest_changes_with_library_version(monkeypatch):
-    monkeypatch.setattr(module, "PRODUCT_PACKAGES", ())
     found = set()
     for version in ("1", "2"):
         monkeypatch.setattr(module, "list_library_versions", lambda: {"trimesh": version})  # noqa: B023
-        found.add(module.code_digest.__wrapped__())
+        found.add(module.code_digest.__wrapped__(()))
     assert len(found) == 2

@@ -11,7 +11,7 @@ from skinrig.benchmarks import stage as bench_stage
 from skinrig.benchmarks import stages as bench_stages
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.results import ErrorEstimate, Timing
-from skinrig.console import Console
+from skinrig.console import Console, to_json_value
 from skinrig.errors import MissingExtra
 
 NAMES = ("a", "b", "c")
@@ -33,12 +33,12 @@ def stage(name, calls, seconds=0.0, error=None):
 
 
 clock = SimpleNamespace(now=0.0)
+costs = {"a": 100.0, "b": 10.0, "c": 50.0}
 
 
 @pytest.fixture
 def calls(monkeypatch):
     made = []
-    costs = {"a": 100.0, "b": 10.0, "c": 50.0}
     functions = {name: stage(name, made, costs[name]) for name in NAMES}
     clock.now = 0.0
     monkeypatch.setattr(bench_stages.time, "perf_counter", lambda: clock.now)
@@ -147,6 +147,39 @@ def test_interrupted_long_stage_keeps_measured_results(calls, tmp_path, capsys):
     document = run(600.0, ["a", "b"], out=tmp_path)
     assert [len(document["stages"][name]["points"]) for name in ("a", "b")] == [4, 4]
     assert document["left_out"] == []
+
+
+def test_later_run_keeps_finished_stages(calls, tmp_path, capsys):
+    for name in ("a", "b", "a"):
+        run(600.0, [name], out=tmp_path)
+    document = run(600.0, out=tmp_path)
+    again = [("c", "small"), ("c", "full")]  # of all stages, the unmeasured one alone
+    assert calls[1:] == [("a", "full"), ("b", "full"), ("a", "full"), *again]
+    assert list(document["stages"]) == list(NAMES)
+    assert json.loads((tmp_path / "bench.json").read_text()) == to_json_value(document)
+    bench_table.write_tables(document, tmp_path)
+
+
+def test_interrupted_stage_is_measured_again(calls, tmp_path, capsys):
+    calls[0]["c"] = stage("c", calls, error=KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        run(60.0, out=tmp_path)
+    calls[0]["c"] = stage("c", calls, costs["c"])
+    del calls[1:]
+    document = run(60.0, out=tmp_path)
+    assert calls[1:] == [("c", "small"), ("b", "full")]
+    assert document["left_out"] == []
+    assert document["not_judged"] == ["a", "c"]
+
+
+@pytest.mark.parametrize("changed", [{"code": "x"}, {"toy": True}, {"machine": {}}, None])
+def test_incomparable_document_is_replaced_with_notice(changed, calls, tmp_path, capsys):
+    run(600.0, ["a"], out=tmp_path)
+    path = tmp_path / "bench.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changed) if changed else "{")
+    capsys.readouterr()
+    assert list(run(600.0, ["b"], out=tmp_path)["stages"]) == ["b"]
+    assert "this run replaces it" in capsys.readouterr().err
 
 
 def test_uncreatable_folder_is_reported_before_measuring(calls, tmp_path):
