@@ -164,6 +164,8 @@ def main(argv: list[str] | None = None) -> int:
     except (typer.Abort, KeyboardInterrupt):
         return _report_failure(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
     except Exception as error:
+        if errors.is_interruption(error):  # an import that Ctrl-C ends raises a SystemError
+            return _report_failure(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
         if hasattr(error, "exit_code") and hasattr(error, "show"):  # a usage error of Typer's
             error.show()
             return _report_failure(error, errors.EXIT_USAGE, given, print_message=False)

@@ -19,6 +19,8 @@ Exit codes:
 import errno
 import re
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import TypeVar
 
 Choice = TypeVar("Choice", bound=str)
@@ -142,6 +144,27 @@ def exit_code(error: BaseException) -> int:
     return EXIT_BUG
 
 
+def is_interruption(error: BaseException | None) -> bool:
+    """Return whether an exception is Ctrl-C, or was raised because of it.
+
+    Examples
+    --------
+    >>> error = SystemError("import failed")
+    >>> error.__cause__ = KeyboardInterrupt()
+    >>> is_interruption(error), is_interruption(SystemError("import failed"))
+    (True, False)
+    """
+    waiting, followed = [error], set[int]()
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, KeyboardInterrupt):
+            return True
+        if one is not None and id(one) not in followed:
+            followed.add(id(one))
+            waiting += [one.__cause__, one.__context__]
+    return False
+
+
 _ADVICE_BY_ERROR = {
     errno.ENOENT: "check the name, and the folder that the command runs in [SR-CLI-001]",
     errno.EEXIST: "a file or folder of that name exists; name another",
@@ -182,18 +205,19 @@ def format_interruption(given: Sequence[str]) -> str:
 
     Examples
     --------
-    >>> format_interruption(["simulate", "flash"])
-    'interrupted; run the same command with --resume to continue'
+    >>> format_interruption(["simulate", "flash", "--out", "not-begun"])
+    'interrupted; run the same command again'
     >>> format_interruption(["bench", "--out", "bench"])
     'interrupted; bench.json in --out keeps what was measured'
     """
     command = find_command(given)
     if command == "serve":  # it resumes from the session of its client, not from its own
         return "interrupted; serve with --resume SESSION to continue a session captured from it"
-    if command in RESUMABLE_COMMANDS:
+    words = [part for word in given for part in word.split("=", 1)]
+    out = next((after for word, after in pairwise(words) if word == "--out"), None)
+    if command in RESUMABLE_COMMANDS and out and Path(out, "session.json").is_file():
         return "interrupted; run the same command with --resume to continue"
-    kept = any(word == "--out" or word.startswith("--out=") for word in given)
-    if command == "bench" and kept and "--extremes" not in given:
+    if command == "bench" and out and "--extremes" not in given:
         return "interrupted; bench.json in --out keeps what was measured"
     if command == "reconstruct":
         return "interrupted; run the same command again: it takes up the finished stages"

@@ -279,8 +279,23 @@ def test_interrupted_command_is_reported(monkeypatch, capsys):
     assert json.loads(out)["exit_code"] == 130
 
 
-def test_interrupted_command_suggests_resuming_where_possible():
-    """Those with the option, and no others, are told of it."""
+def test_interrupted_import_exits_as_interrupted(monkeypatch, capsys):
+    def interrupted(path, **_):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:
+            raise SystemError("__import__ returned a result with an exception set") from stop
+
+    monkeypatch.setattr("capture.session.verify", interrupted)
+    assert main(["verify", "session"]) == 130
+    assert "defect" not in capsys.readouterr().err
+
+
+def test_interrupted_command_suggests_resuming_where_possible(tmp_path):
+    """Those with the option, and no others, are told of it, once their session exists."""
+    place = ["--json", f"--out={tmp_path}"]
+    assert "--resume" not in errors.format_interruption(["simulate", *place])
+    (tmp_path / "session.json").touch()
     commands = get_command(app).commands
     resumable = {
         name
@@ -289,7 +304,7 @@ def test_interrupted_command_suggests_resuming_where_possible():
         if any("--resume" in option.opts for option in one.params)
     }
     assert resumable == set(errors.RESUMABLE_COMMANDS)
-    told = {name: errors.format_interruption([name, "--json"]) for name in commands}
+    told = {name: errors.format_interruption([name, *place]) for name in commands}
     assert {name for name, text in told.items() if "--resume" in text} == resumable
 
 
