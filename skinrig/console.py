@@ -5,12 +5,11 @@ import logging
 import math
 import re
 import sys
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from skinrig.progress import Progress, watch
+from skinrig.progress import Progress, command_start_s, watch
 
 
 def to_json_value(value: Any) -> Any:
@@ -102,7 +101,7 @@ class Console:
     as_json: bool = False
     quiet: bool = False
     """Whether only progress is printed: the caller prints its own summary."""
-    started_s: float = field(default_factory=time.perf_counter)
+    started_s: float = field(default_factory=command_start_s)
     _progress: Progress = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

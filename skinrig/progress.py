@@ -128,6 +128,11 @@ def watch(progress: Progress | None) -> None:
     _watched[:] = [] if progress is None else [progress]
 
 
+def command_start_s() -> float:
+    """Return the clock at the command's start, or now where no step is watched."""
+    return _watched[0].started_s if _watched else time.perf_counter()
+
+
 def watch_start(as_json: bool) -> None:
     """Report the loading of libraries, if the first step comes late."""
     now = time.perf_counter()

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from capture import raw
 from capture.documents import Fault, InputError
@@ -25,11 +24,14 @@ from capture.importers.imported_session import (
     restate_white,
 )
 from capture.importers.pair_exposures import relate_exposures
+from capture.importers.video_frames import ImageSource
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Rig, View
 from capture.session import Session, SubjectRecord
 
 logger = logging.getLogger(__name__)
+
+Report = Callable[[str], None]
 
 IMPORTED_RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
@@ -103,8 +105,8 @@ def import_photos(
     kind: Kind = "subject",
     subject: SubjectRecord | None = None,
     framing: Framing | None = None,
-    assumed: Sequence[str] = (),
-    video: Mapping[str, Any] | None = None,
+    source: ImageSource | None = None,
+    progress: Report = lambda _text: None,
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -135,10 +137,10 @@ def import_photos(
         Person in the photographs; default an unnamed one who agreed to nothing beyond the capture.
     framing : Framing, optional
         Part and width of the photographs to import; default: all of them.
-    assumed : sequence of str
-        What the caller assumed; stored before the import's own assumptions.
-    video : mapping, optional
-        Description of the video whose frames these are, for the manifest; see `ImageSource`.
+    source : ImageSource, optional
+        Origin of the photographs; its assumptions are stored before the import's own.
+    progress : callable
+        Called with the number and the count before each photograph is read, and is stored.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -155,7 +157,7 @@ def import_photos(
     """
     clock = now or (lambda: datetime.now(UTC))
     files, ignored = _files(Path(directory))
-    framing = framing or Framing()
+    framing, source = framing or Framing(), source or ImageSource(Path(directory))
     if rig is not None and framing != Framing():
         raise PhotoError(
             "cannot be imported so",
@@ -163,23 +165,24 @@ def import_photos(
             faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
             advice="Leave the rig out, or crop and width.",
         )
-    repair = "Repair these files or move them away" if video is None else "Cut these frames out"
-    entries = _inspect(files, framing, turn_raw=rig is None, repair=repair)
+    repair = "Cut these frames out" if source.video else "Repair these files or move them away"
+    entries = _inspect(files, framing, progress, turn_raw=rig is None, repair=repair)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps, exposures = _relate_pairs(_steps(entries, views, kind))
     own = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
-    assumed = [*assumed, *own, *_list_unequal_partners(steps), *exposures]
+    assumed = [*source.assumed, *own, *_list_unequal_partners(steps), *exposures]
     plan = Plan(used.name, tuple(step for step, _ in steps))
     listed = [
         {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}
         | ({"face": list(e.face)} if e.face else {})
         for s, e in steps
     ]
-    extra = {"assumed": assumed, "photographs": listed} | ({"video": dict(video)} if video else {})
+    extra = {"assumed": assumed, "photographs": listed} | source.to_manifest()
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
-        for step, entry in steps:
+        for number, (step, entry) in enumerate(steps):
+            progress(f"store photograph {number}/{len(steps)}: {entry.file.name}")
             _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
@@ -222,7 +225,7 @@ def _advise(names: Sequence[str]) -> str:
 
 
 def _inspect(
-    files: Sequence[Path], framing: Framing, *, turn_raw: bool, repair: str
+    files: Sequence[Path], framing: Framing, progress: Report, *, turn_raw: bool, repair: str
 ) -> list[_Entry]:
     """Decode every file once, so that a bad one is found before anything is written.
 
@@ -230,7 +233,8 @@ def _inspect(
     """
     entries, faults = [], []
     placed: dict[tuple[str, tuple[int, ...]], tuple[Framing, tuple[float, ...]]] = {}
-    for file in files:
+    for number, file in enumerate(files):
+        progress(f"read photograph {number}/{len(files)}: {file.name}")
         try:
             photo = read_photo(file, turn_raw=turn_raw)
             if photo.white_value == 0.0:

@@ -52,6 +52,10 @@ class ImageSource:
     assumed: tuple[str, ...] = ()
     video: Mapping[str, Any] | None = None
 
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the entry of a session's manifest; empty unless it was a video."""
+        return {"video": dict(self.video)} if self.video else {}
+
 
 def is_video(path: Path) -> bool:
     """Return whether a path is a file with the suffix of a video."""

@@ -17,7 +17,12 @@ from skinrig.command_line.options import (
     command,
 )
 from skinrig.console import Console, format_count, select_attributes
-from skinrig.next_steps import DEFAULT_WANTS, shell_quote
+from skinrig.next_steps import DEFAULT_WANTS, OPEN_COMMAND, shell_quote
+
+LARGE_IMAGE_PX = 2_000_000
+"""Number of pixels of an image above which `import photos` advises to average them."""
+ADVISED_WIDTH_PX = 1000
+"""Width that it advises."""
 
 if TYPE_CHECKING:
     from reconstruction.pipeline.diagnosed_images import DiagnosedImages
@@ -69,6 +74,7 @@ def import_photos(
     from capture.importers.framing import Framing
     from capture.importers.video_frames import open_source
     from capture.rig import load_rig
+    from capture.session import Session
     from skinrig.consent import parse_subject
 
     console = Console(json)
@@ -81,14 +87,20 @@ def import_photos(
             kind="chart" if target else "subject",
             subject=person,
             framing=Framing.parse(crop, width),
-            assumed=source.assumed,
-            video=source.video,
+            source=source,
+            progress=console.progress,
         )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
+    largest_px = max(v.width_px * v.height_px for v in Session.open(out).rig.all_views)
+    if largest_px > LARGE_IMAGE_PX and not (rig or target):
+        console.print_line(
+            f"advice: images have up to {largest_px / 1e6:.1f} million pixels; import them with "
+            f"--width {ADVISED_WIDTH_PX} for faster maps"
+        )
     place = shell_quote(out)
     findings = []
     if done.has_pairs and not target:
@@ -150,7 +162,7 @@ def photo(
     )
     console.print_each("assumed", done.assumed)
     console.print_line(f"{done.appearance}: melanin, hemoglobin and the image")
-    console.print_line(f"{done.report}: open it in a browser")
+    console.print_line(f"next: {OPEN_COMMAND} {shell_quote(done.report)}")
     values = select_attributes(done, "session", "appearance", "report", "assumed")
     console.print_document("skinrig.photo/1", values)
 

@@ -61,7 +61,8 @@ def report(
     console.progress(f"draw the report of {format_count(len(paths), 'path')}")
     from skinrig.reporting.report import build_any
 
-    done = build_any(paths, compare=compare, folder=None if piped else out.absolute().parent)
+    place = None if piped else out.absolute().parent
+    done = build_any(paths, compare=compare, folder=place, progress=console.progress)
     if piped:
         typer.echo(done.html, nl=False)
     else:

@@ -59,7 +59,8 @@ def write(
     out = ImageFolder(folder, delivery, appearance)
     on_mesh = any(name in appearance.files for name in MESH_FILES)
     shown: dict[str, tuple[str, str]] = {}  # file and type by name in the material file
-    for name in names:
+    for number, name in enumerate(names):
+        delivery.report(f"content {number}/{len(names)}: {name}")
         image = _image(name, appearance.maps[name], delivery, on_mesh)
         exr = out.write_exr(image)
         out.write_png(image)

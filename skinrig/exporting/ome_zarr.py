@@ -64,7 +64,8 @@ def write(
         zarr_format=3,
         attributes={"ome": {"version": OME_VERSION}, "skinrig": about},
     )
-    for name in names:
+    for number, name in enumerate(names):
+        delivery.report(f"content {number}/{len(names)}: {name}")
         one = appearance.maps[name]
         text = {"unit": one.unit, "description": one.description, **about}
         _write_image(root.create_group(name), name, one.values, one, text)

@@ -99,6 +99,7 @@ def build_any(
     reload_s: int | None = None,
     folder: Path | None = None,
     drawn: DrawnSections | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Return the report on a collection, or the comparison of two runs.
 
@@ -112,6 +113,8 @@ def build_any(
         Whether two runs are compared; None: by the rule of `run_comparison.split_sides`.
     reload_s, folder, drawn
         As for `build`; a comparison is never loaded again, and none of it is reused.
+    progress
+        Called with the number and the count before each section of maps, and before the rest.
 
     Raises
     ------
@@ -134,7 +137,7 @@ def build_any(
     checks_of_all: list[page.Check] = []
     found = discover(places)
     appearances = _read_appearances(found)
-    body = _build_sections(found, appearances, checks_of_all, folder, drawn)
+    body = _build_sections(found, appearances, checks_of_all, folder, drawn, progress)
     first = _first_screen(found, appearances)
     lead = verdict_section.section(
         checks_of_all, found.summary(), _list_least_certain(found), first
@@ -195,11 +198,12 @@ def _build_sections(
     checks: list[page.Check],
     folder: Path | None,
     drawn: DrawnSections | None,
+    progress: Callable[[str], None] | None,
 ) -> list[page.Block]:
     """Return the sections of a report, and add its checks."""
     sessions = session.read_session_facts(found.sessions)
     return [
-        *_maps(found, appearances, checks, drawn),
+        *_maps(found, appearances, checks, drawn, progress),
         *(
             block
             for number, face in enumerate(found.faces)
@@ -220,9 +224,12 @@ def _maps(
     appearances: Mapping[str, SkinAppearance],
     checks: list[page.Check],
     drawn: DrawnSections | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Iterator[page.Block]:
     drawn = DrawnSections() if drawn is None else drawn
-    for name, appearance in appearances.items():
+    for number, (name, appearance) in enumerate(appearances.items()):
+        if progress is not None:
+            progress(f"draw section {number}/{len(appearances)}: {name}")
         if dynamic.is_dynamic(appearance):
             again = ""
             draw = partial(_dynamic_section, found=found)

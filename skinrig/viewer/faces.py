@@ -26,6 +26,7 @@ from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
+from skinrig.viewer.assets.placed_color import read_image_landmarks
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
 from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.pictures import PICTURE_PX, build_picture_scene, find_states
@@ -128,8 +129,8 @@ def assemble_scene(
 ) -> ViewerScene:
     """Assemble the scene of a source from all asset builders; ``progress`` gets each content."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance)
-    for content, build in ASSET_BUILDERS.items():
-        progress(content)
+    for number, (content, build) in enumerate(ASSET_BUILDERS.items()):
+        progress(f"content {number}/{len(ASSET_BUILDERS)}: {content}")
         scene = scene.with_assets(build(source))
     names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
     return scene.with_assets(
@@ -233,6 +234,9 @@ def build_scene(
         return build_picture_scene(
             folders[PICTURE_KIND], appearances[PICTURE_KIND], size=side, progress=progress
         )
+    if "flash" in folders:  # refuse an image without landmarks before anything is computed
+        truth = appearances["flash"].parameters.get("truth")
+        read_image_landmarks(folders["flash"], truth, landmarks)
     if size is None:
         size = PEOPLE_PX if people else FACE_PX
     whole, mesh_origin = _mesh(appearances, mesh)

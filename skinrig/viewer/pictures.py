@@ -83,7 +83,7 @@ def build_picture_scene(
         raise SceneError(f"{path}: got normals of several sizes, expected one; show each alone")
     if not any(one.mask.any() for one in maps):
         raise SceneError(f"{path}: no pixel of the normals is valid; reconstruct them again")
-    progress("normals")
+    progress("content 0/2: normals")
     packed = [np.dstack([_reduce(one, size), _valid_fraction(one, size)]) for one in maps]
     textures = {
         "picture_normals": Texture(
@@ -92,7 +92,7 @@ def build_picture_scene(
     }
     facts: dict[str, Any] = {"states": list(states), "aspect": shape[1] / shape[0]}
     roughness = _roughness(appearance)
-    progress("color and uncertainty")
+    progress("content 1/2: color and uncertainty")
     left_out = [("shadows and interreflection", "a picture has normals, not a surface")]
     color = _stack_maps(appearance, states, COLOR_MAPS, shape)
     if color is None:

@@ -10,6 +10,8 @@ from PIL import Image
 
 from capture.rig import load_rig
 from capture.session.disk import Disk
+from model import store
+from model.skin import SkinAppearance, SkinMap
 from skinrig import errors
 from skinrig.cli import main
 from skinrig.command_line import completion
@@ -78,6 +80,34 @@ def test_of_several_photographs_the_states_there_are_named(photos, tmp_path, cap
     assert "has no photograph of state 'neutral'; it has those of a, b" in said
     assert "--state a" in said
     assert "crossed-polarized frame" not in said
+
+
+def test_large_photographs_are_advised_to_be_averaged(photos, tmp_path, capsys):
+    Image.new("RGB", (64, 64), "gray").save(photos / "a.png")
+    assert bring(photos, tmp_path / "small") == 0
+    assert "advice:" not in capsys.readouterr().out
+    Image.new("RGB", (2048, 1024), "gray").save(photos / "a.png")
+    assert bring(photos, tmp_path / "large") == 0
+    assert "advice: images have up to 2.1 million pixels" in capsys.readouterr().out
+
+
+def test_counted_progress_precedes_each_part(photos, tmp_path, capsys):
+    for name in ("a.png", "b.png"):
+        photograph(photos / name)
+    flat = np.broadcast_to([0.0, 0.0, 1.0], (16, 16, 3))
+    maps = {"normals": SkinMap(flat, "1"), "r_d": SkinMap(np.full((16, 16, 3), 0.4), "1")}
+    place = str(store.write(tmp_path / "maps", SkinAppearance(maps, "simulated")))
+    out = str(tmp_path / "out")
+    for argv, text in (
+        (["import", "photos", str(photos), "--out", out + "s"], "read photograph 1/2: b.png"),
+        (["report", place, "--out", out + ".html"], "draw section 0/1: maps"),
+        (["view", place, "--out", out + "v.html"], "content 1/2: color and uncertainty"),
+        (["export", place, "--to", "maps", "--out", out], "content 1/2: r_d"),
+    ):
+        assert main([*argv, "--json"]) == 0
+        events = [json.loads(line) for line in capsys.readouterr().err.splitlines() if "{" in line]
+        (found,) = [one for one in events if one["text"] == text]
+        assert (found["left_s"] is None) == ("0/" in text)
 
 
 def test_full_disk_during_import_suggests_reimport(photos, tmp_path, capsys, monkeypatch):

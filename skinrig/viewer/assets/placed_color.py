@@ -148,7 +148,7 @@ def _place(
 ) -> tuple[TexelPlacement, Atlas]:
     """Place the texels of the scene's mesh in an image of `shape` by landmarks of both."""
     subject = source.subject
-    marks = read_image_landmarks(source, kind, truth)
+    marks = read_image_landmarks(source.paths[kind], truth, source.landmarks)
     surface = subject.surface_landmarks()
     points = {
         name: (float(p[0]), float(p[1]), float(p[2]))
@@ -184,33 +184,34 @@ def _describe_placement(source: SceneSource, kind: Kind, where: TexelPlacement) 
 
 
 def read_image_landmarks(
-    source: SceneSource, kind: Kind, truth: object
+    path: Path, truth: object, table: Path | None
 ) -> dict[str, tuple[float, float]]:
     """Read the landmarks of the flash rig's neutral image, px.
 
     Parameters
     ----------
-    source
-        Source with maps of that image.
-    kind
-        Their kind, "dynamic" or "flash".
+    path
+        Folder with maps of that image.
     truth
-        Name of the ground truth next to their folder; no text: there is none.
+        Name of the ground truth next to that folder; no text: there is none.
+    table
+        Table ``name,x,y``; None: the landmarks of the ground truth.
 
     Raises
     ------
     SceneError
         If there is neither a table nor a simulation's ground truth next to the folder.
     """
-    if source.landmarks is not None:
-        return landmark_table.read_landmark_table(source.landmarks)
+    if table is not None:
+        return landmark_table.read_landmark_table(table)
     if isinstance(truth, str):
-        folder = source.paths[kind].resolve().parent / Path(truth).name
+        folder = path.resolve().parent / Path(truth).name
         if (folder / store.DOCUMENT_FILE).is_file():
             points: Any = store.read_document(folder).parameters.get("landmarks_px")
             if isinstance(points, dict):
                 return {key: (float(x), float(y)) for key, (x, y) in points.items()}
     raise SceneError(
-        f"{source.paths[kind]}: got maps of an image without landmarks, expected some to map "
-        "them to the mesh; give --landmarks FILE, a table name,x,y of the neutral image"
+        f"{path}: got maps of an image without landmarks, expected some to map them to the mesh; "
+        "show them by `skinrig report`, or give --landmarks FILE, a table name,x,y of the neutral "
+        "image"
     )

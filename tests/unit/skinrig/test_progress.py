@@ -94,13 +94,16 @@ def test_thread_beats_only_while_command_runs():
 def test_late_first_step_reports_loading(capsys, monkeypatch):
     monkeypatch.setattr("skinrig.progress.BEAT_S", 0.0)
     watch_start(True)
+    console = Console(True)
+    time.sleep(0.05)
     err = ""
     with beat_while_running():
         deadline = time.monotonic() + 20.0
         while not err and time.monotonic() < deadline:
             time.sleep(0.01)
             err = capsys.readouterr().err
-        Console(True).print_line("done")
+        assert Console(True).started_s == console.started_s  # seconds never run backward
+        console.print_line("done")
     assert json.loads(err.splitlines()[0])["text"] == "load the libraries"
     assert capsys.readouterr().err.splitlines()[-1] == "done"
 

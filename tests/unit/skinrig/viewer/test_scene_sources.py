@@ -177,6 +177,15 @@ def test_two_colors_of_one_face_are_refused(folder):
         procedural.build_scene([folder / "second"], size=64)
 
 
+def test_photograph_is_refused_before_textures(tmp_path, monkeypatch):
+    monkeypatch.setattr(procedural, "FineSkin", None)
+    values, names = np.full((4, 4), 0.1), ("melanin", "hemoglobin")
+    maps = {name: SkinMap(values, MAP_UNITS[name]) for name in names}
+    store.write(tmp_path / "maps", SkinAppearance(maps, "simulated"))
+    with pytest.raises(SceneError, match="show them by `skinrig report`"):
+        procedural.build_scene([tmp_path / "maps"])
+
+
 def test_image_without_landmarks_is_refused_with_remedy(folder):
     with pytest.raises(SceneError, match="--landmarks FILE"):
         procedural.build_scene([folder / "appearance"], size=64)
