@@ -22,6 +22,12 @@ CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
     "probe": {"phantom": "fiber"},
 }
 """Calibration by rig and target."""
+TARGETS_BY_CALIBRATION: Final[Mapping[tuple[str, str], tuple[str, ...]]] = {
+    ("lights", "mirror"): ("mirror", "white"),
+    ("lights", "white"): ("mirror", "white"),
+    ("sensor", "dark"): ("flat", "dark"),
+}
+"""All targets of a calibration by its kind and one of them, where it needs several."""
 DEFAULT_WANTS: Final[Mapping[str, str]] = {
     "flash": "melanin,hemoglobin",
     "dome": "normals,r_d",
@@ -32,6 +38,7 @@ DEFAULT_WANTS: Final[Mapping[str, str]] = {
 """Maps usually reconstructed from a session of skin, by rig."""
 OPEN_COMMAND: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
 DEMO_FOLDER: Final = "demo"
+PORTRAIT_FOLDER: Final = "portrait"
 MAX_STEPS: Final = 4
 """Maximum number of suggested steps."""
 
@@ -98,18 +105,35 @@ def suggest_after_session(
         if rig == "probe" and not calibrated:  # its reconstruction requires calibrated fibers
             if phantom is not None:
                 return suggest_after_session(rig, phantom, "phantom", calibration=calibration)
-            made = "capture" if source == "measured" else "simulate"
-            return f"skinrig {made} probe --target phantom --out session-phantom"
+            return _suggest_target(rig, session, "phantom", source)
         needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
         return f"skinrig reconstruct {place} --maps {want}{needs} --out appearance"
     kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
     if kind is None:
         return f"skinrig verify {place}"
-    given = place
-    if rig == "dome" and kind == "lights":  # one calibration from two targets
-        given = f"{place} SESSION-WHITE" if target == "mirror" else f"SESSION-MIRROR {place}"
+    near = scan(Path(session).parent).sessions.items()
+    found = {_target(d): p for p, d in near if d.get("rig", {}).get("name") == rig}
+    found[target] = Path(session)
+    targets = TARGETS_BY_CALIBRATION.get((kind, target), (target,))
+    placed = (rig, kind) != ("dome", "lights") or Path(calibration, "geometry.json").is_file()
+    for other in (*targets, *(() if placed else ("charuco",))):
+        if other not in found:
+            return _suggest_target(rig, session, other, source)
+    if not placed:  # light directions are estimated by calibrated cameras
+        return f"skinrig calibrate geometry {shell_quote(found['charuco'])} --out {store}"
+    given = " ".join(shell_quote(found[one]) for one in targets)
     return f"skinrig calibrate {kind} {given} --out {store}"
+
+
+def _suggest_target(rig: str, session: str | Path, target: str, source: str) -> str:
+    """Return the command that makes the session of a target on the rig of another session."""
+    made = "capture" if source == "measured" else "simulate"
+    seed = (read_document(Path(session) / "session.json") or {}).get("seed")
+    option = f" --seed {seed}" if seed and made == "simulate" else ""
+    out = f"session-{target}"
+    out = f"session-{rig}-{target}" if Path(out).exists() else out
+    return f"skinrig {made} {rig} --target {target}{option} --out {out}"
 
 
 def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
@@ -166,6 +190,9 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         use = " --use research" if measured else ""
         command = f"skinrig export {shell_quote(given)} --to maps{use} --out export"
         steps.append(Step(command, "files for other programs"))
+    if found.photographs and not Path(PORTRAIT_FOLDER).exists():
+        command = f"skinrig photo {shell_quote(found.photographs[0])} --out {PORTRAIT_FOLDER}"
+        steps.append(Step(command, "maps of the face in the photograph, and a report"))
     if found.photographs and not found.sessions:
         command = f"skinrig import photos {here} --out session"
         steps.append(Step(command, "a session from the photographs"))

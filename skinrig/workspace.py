@@ -28,7 +28,7 @@ class Workspace:
     truths: tuple[Path, ...] = ()
     calibrations: tuple[Path, ...] = ()
     reports: tuple[Path, ...] = ()
-    photographs: int = 0
+    photographs: tuple[Path, ...] = ()
 
     def summary(self) -> str:
         """Return the number of each kind in one line; empty if there are none."""
@@ -37,7 +37,7 @@ class Workspace:
             (len(self.calibrations), "calibration"),
             (len(self.appearances), "appearance"),
             (len(self.reports), "report"),
-            (self.photographs, "photograph"),
+            (len(self.photographs), "photograph"),
         ]
         return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
 
@@ -67,7 +67,7 @@ def scan(folder: Path) -> Workspace:
         elif entry.name.startswith("calibration") and entry.is_dir():
             calibrations.append(entry)
     reports = [e for e in entries if e.suffix == ".html" and _is_report(e)]
-    photographs = sum(e.suffix.lower() in PHOTOGRAPH_SUFFIXES for e in entries)
+    photographs = tuple(e for e in entries if e.suffix.lower() in PHOTOGRAPH_SUFFIXES)
     return Workspace(
         sessions, appearances, tuple(truths), tuple(calibrations), tuple(reports), photographs
     )

@@ -184,10 +184,7 @@ def fit_microstructure(
         low, high = one.table.stretch_range
         how = f"{one.kernels} kernels" if one.kernels else "the paper's forehead table"
         console.print_line(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
-    console.print_line(
-        f"next: skinrig apply microstructure {shell_quote(out)} --mesh MESH --weights SHAPE=1 "
-        "--out DIR"
-    )
+    console.print_line(f"next: skinrig view {shell_quote(out)}")
     sites = {site: one.document() for site, one in found.items()}
     print_fit(console, "microstructure", out, {"sites": sites})
 

@@ -170,7 +170,7 @@ def fit_traits(
     names = found.library.names
     console.print_line(f"{out}: {len(names)} traits of {len(found.faces)} faces")
     after = f"--space {shell_quote(out)} --trait {names[0]}=1 --out edited"
-    console.print_line(f"next: skinrig edit APPEARANCE {after}")
+    console.print_line(f"next: skinrig edit {shell_quote(appearances[0])} {after}")
     keys = ("part", "trait", "with", "without", "p_value", "expected_cosine")
     learned = {
         "faces": found.faces,

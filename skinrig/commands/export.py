@@ -9,10 +9,12 @@ from skinrig.command_line.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, require_choice
 from skinrig.exporting.options import ExportSettings, SkinPosition
+from skinrig.next_steps import shell_quote
 
+OPEN_ZARR: Final = "in Python: xarray.open_zarr({store!r}, group={group!r}, consolidated=False)"
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
-    "ome-zarr": "in Python: xarray.open_zarr('DIR/maps.zarr', group='MAP', consolidated=False)",
+    "ome-zarr": OPEN_ZARR,
     "mtlx": "load skin.mtlx on skin.obj; material.json lists the scene unit and assumptions",
     "gltf": "open skin.glb; in Blender, run skin_in_blender.py for subsurface scattering",
     "usd": "open skin.usdc, in Blender with skin_in_blender.py; usd.json lists assumptions",
@@ -20,10 +22,10 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "metahuman": "read delta_maps.json: layout and encoding of the deltas",
     "mitsuba": "read README.txt: how to load the scene, and where it differs from the session",
     "stokes": "read stokes.json: axis, channels, and components not measured",
-    "zarr": "in Python: xarray.open_zarr('DIR/session.zarr', group='KIND', consolidated=False)",
-    "lp": "skinrig import olat DIR --out SESSION reads the folder back",
+    "zarr": OPEN_ZARR,
+    "lp": "skinrig import olat {path} --out {path}-session  (reads the folder back)",
 }
-"""Next step after an export, by format."""
+"""Next step after an export, by format; {path} is its folder, {store} and {group} are in it."""
 
 
 FORMATS: Final = (
@@ -158,6 +160,8 @@ def export(
     after = NEXT_STEP_BY_FORMAT.get(
         to, "pass the folder on; `ascmhl verify` checks that it is complete and unchanged"
     )
+    group = next((one.parent for one in sorted(done.path.glob("*.zarr/*/zarr.json"))), done.path)
+    after = after.format(path=shell_quote(out), store=str(group.parent), group=group.name)
     console.print_omissions(done.left_out)
     console.print_line(
         f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}"

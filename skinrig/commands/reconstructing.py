@@ -1,7 +1,7 @@
 """`skinrig calibrate` and `skinrig reconstruct`: calibrations and maps from sessions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -78,7 +78,10 @@ def calibrate(
     ]
     verdict = f"check {' and '.join(remarks)} before use" if remarks else "usable, no finding"
     console.print_line(f"{done.path}: {verdict}; valid until {done.calibration.valid_until}")
-    for step in suggest(scan(out.parent), out.parent):
+    near = scan(out.parent)
+    rig = done.calibration.rig
+    own = {p: d for p, d in near.sessions.items() if d.get("rig", {}).get("name") == rig}
+    for step in suggest(replace(near, sessions=own), out.parent):
         if step.command.startswith("skinrig reconstruct"):
             console.print_line(f"next: {step.command}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
@@ -339,11 +342,11 @@ def fit_template(
         "match": found.pose.match,
     }
     console.print_table(("figure", "value"), figures.items())
-    session = shell_quote(scan) if scan.is_dir() else "SESSION"
-    console.print_line(
-        f"next: skinrig reconstruct {session} --scan {shell_quote(out)} --maps normals "
-        "--out appearance"
-    )
+    if scan.is_dir():
+        console.print_line(
+            f"next: skinrig reconstruct {shell_quote(scan)} --scan {shell_quote(out)} "
+            "--maps normals --out appearance"
+        )
     print_fit(console, "template", out, figures)
 
 

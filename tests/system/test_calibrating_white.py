@@ -24,13 +24,15 @@ def test_a_face_makes_no_white_reference(subject, tmp_path, capsys):
 
 def test_small_simulated_white_reference_works_partial_is_reported(tmp_path, capsys, monkeypatch):
     simulate_session("flash", tmp_path / "tile", target="white", width_px=96)
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "session.json").write_text('{"rig": {"name": "imported"}}')
     calibration = tmp_path / "calibration"
     command = ["calibrate", "white", str(tmp_path / "tile"), "--out", str(calibration)]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "found:" not in said
     assert "usable, no finding; valid until" in said
-    assert "next:" not in said  # no session of skin is near
+    assert "next:" not in said  # no session of skin of this rig is near
     assert (calibration / "white.json").exists()
     monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.9)
     assert main(command) == 0

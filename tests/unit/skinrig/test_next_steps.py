@@ -64,7 +64,10 @@ def test_an_empty_folder_begins_with_the_demo():
 
 def test_photographs_are_imported():
     Path("anna.NEF").touch()
-    assert commands()[0].startswith("skinrig import photos .")
+    wanted = ["skinrig photo anna.NEF --out portrait", "skinrig import photos . --out session"]
+    assert commands() == wanted
+    Path("portrait").mkdir()
+    assert commands() == wanted[1:]
 
 
 def test_skin_session_is_reconstructed_with_own_calibration():
@@ -206,10 +209,31 @@ def test_damaged_documents_do_not_stop_next_steps():
     [(rig, target) for rig, kinds in CALIBRATION_BY_TARGET.items() for target in kinds],
 )
 def test_each_target_leads_to_a_calibration_that_exists(rig, target, capsys):
+    for number, other in enumerate(CALIBRATION_BY_TARGET[rig]):  # dome lights need two targets
+        session(Path(f"session-{number}"), rig, target=other)
     words = suggest_after_session(rig, "session", target).split()
     assert words[:2] == ["skinrig", "calibrate"]
     assert main([*words[1:3], "missing"]) == 3
     assert "missing" in capsys.readouterr().err
+
+
+def test_dome_lights_follow_both_targets_and_geometry():
+    def after(session, target, source="simulated"):
+        return suggest_after_session("dome", session, target, source=source)
+
+    made = "skinrig simulate dome --target white --out session-white"
+    assert after("a", "mirror") == made
+    session(Path("session-white"), "flash", target="white")
+    assert after("a", "mirror") == made.replace("session-white", "session-dome-white")
+    assert after("b", "white", "measured").startswith("skinrig capture dome --target mirror")
+    session(Path("b"), "dome", target="white")
+    assert after("a", "mirror").startswith("skinrig simulate dome --target charuco")
+    session(Path("c"), "dome", target="charuco")
+    assert after("a", "mirror") == "skinrig calibrate geometry c --out calibration"
+    calibration(Path("calibration"), "dome", "geometry")
+    assert after("a", "mirror") == "skinrig calibrate lights a b --out calibration"
+    made = suggest_after_session("flash", "d", "dark")
+    assert made == "skinrig simulate flash --target flat --out session-flat"
 
 
 def test_nothing_typed_prints_the_next_steps(capsys):
