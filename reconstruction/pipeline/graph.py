@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from reconstruction.pipeline.checkpoints import Checkpoints
 from reconstruction.pipeline.run_progress import RunProgress
+
+UNWANTED_REASON: Final = "no wanted product depends on it"
+"""Reason for which a stage is omitted that was not requested."""
 
 
 class StageError(ValueError):
@@ -261,7 +264,7 @@ def run_stages(
     for product in want:
         provide(product)
     ran = [stage.name for stage in running]
-    left_out = [(s.name, "no wanted product depends on it") for s in stages if s not in needed]
+    left_out = [(s.name, UNWANTED_REASON) for s in stages if s not in needed]
     idle = [s.name for s in needed if s.name not in ran and s.name not in reused]
     left_out += [(name, "the stages that depend on it were reused") for name in idle]
     wanted = {product: products[product] for product in want}
@@ -307,7 +310,7 @@ def record_run(
 
     def entry(name: str) -> dict[str, str]:
         key = outcome.keys.get(name, "")
-        done, why = "skipped", skipped.get(name, "no wanted product depends on it")
+        done, why = "skipped", skipped.get(name, UNWANTED_REASON)
         if name in outcome.reused:
             done, why = "reused", "its inputs are the same"
         elif name in outcome.ran:

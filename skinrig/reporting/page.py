@@ -148,6 +148,11 @@ class Table(Block):
     head: Sequence[Cell]
     rows: Sequence[Sequence[Cell]]
 
+    @property
+    def title(self) -> str:
+        """First sentence of the caption: what is seen of a folded table."""
+        return re.split(r"\. (?=[A-Z])", self.caption)[0]
+
 
 @dataclass(frozen=True, slots=True)
 class ColorScale:
@@ -329,7 +334,12 @@ def render_fragment(blocks: Iterable[Block]) -> str:
 
 
 def render_page(
-    title: str, lead: Iterable[Block], sections: Iterable[Block], *, reload_s: int | None = None
+    title: str,
+    lead: Iterable[Block],
+    sections: Iterable[Block],
+    *,
+    reload_s: int | None = None,
+    folded: bool = True,
 ) -> str:
     """Return the whole page; it makes no request, and its one script enlarges images.
 
@@ -343,6 +353,8 @@ def render_page(
         Blocks below the contents.
     reload_s
         Seconds after which a browser loads the page again; None: never.
+    folded
+        Fold the tables of the sections; those of the lead are open.
     """
     style = PAGE_STYLE + _bars() + frame_sheet.build_style()
     taken = {"content", "contents"}
@@ -358,6 +370,7 @@ def render_page(
         f"script-src '{templates.hash_inline(PAGE_SCRIPT)}'; base-uri 'none'; form-action 'none'",
         lead=head,
         body=body,
+        folded=folded,
         titled=[part for part in head + body if part.anchor],
     )
     return link_repeated_images(page)

@@ -7,6 +7,7 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
+from reconstruction.pipeline.graph import UNWANTED_REASON
 from skinrig import consent
 from skinrig.fusing.finished_face_file import DOCUMENT_FILE as FACE_DOCUMENT
 from skinrig.reporting import page
@@ -43,11 +44,10 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     if isinstance(assumed, (list, tuple)) and assumed:
         yield page.Heading("Assumptions")
         yield page.build_assumptions_table(assumed)
-    if appearance.left_out:
+    omitted = [row for row in appearance.left_out if row[1] != UNWANTED_REASON]
+    if omitted:
         yield page.Heading("Omitted stages")
-        yield page.build_table(
-            ("stage", "reason"), appearance.left_out, caption="Stages that were not run"
-        )
+        yield page.build_table(("stage", "reason"), omitted, caption="Stages that were not run")
     origin = page.build_facts_table(
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": shorten_digest(v) for k, v in sorted(appearance.inputs.items())}

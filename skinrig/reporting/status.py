@@ -261,7 +261,7 @@ def build_status_page(status: FolderStatus) -> str:
         body += [page.Heading(kind.capitalize(), level=2), _table(f"State of {len(own)}", own)]
     if status.checks:
         body += [page.Heading("Checks", level=2), page.build_checks_table(status.checks)]
-    return page.render_page(f"status of {status.name}", lead, body)
+    return page.render_page(f"status of {status.name}", lead, body, folded=False)
 
 
 def _table(caption: str, results: Sequence[ResultState]) -> page.Table:

@@ -118,10 +118,9 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
     yield from _agreement(pair)
     yield page.build_view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
-        table = page.build_table(
+        yield page.build_table(
             ("map", "reason"), pair.refused, caption="Maps that were not subtracted"
         )
-        yield page.Collapsible(f"{len(pair.refused)} maps not subtracted", [table])
     yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)

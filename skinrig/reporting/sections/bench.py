@@ -46,7 +46,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         for name, stage in document["stages"].items()
         if stage["points"]
     ]
-    yield page.Plots(plots)
+    yield page.Collapsible(f"Plots of {len(plots)} stages", [page.Plots(plots)])
     yield page.build_view("benchmark", stages=document["stages"])
     if knees := bench_table.list_knee_rows(document):
         yield page.build_table(
@@ -76,10 +76,9 @@ def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
         for what, why in stage.get("left_out", ())
     ]
     if rows:
-        table = page.build_table(
+        yield page.build_table(
             ("setting", "reason"), rows, caption="Settings that were not measured"
         )
-        yield page.Collapsible(f"{len(rows)} settings not measured", [table])
     if document.get("not_judged"):
         yield page.build_note(
             "Measured at small size; their limits are not checked: "

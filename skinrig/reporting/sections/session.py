@@ -136,8 +136,7 @@ def list_omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
         out = sum(not effect["verdict"] == "built" for effect in effects)
         title = f"{', '.join(names)}: {len(effects) - out} of {len(effects)} effects simulated"
         head = ("effect", "treatment", "reason", "change over noise", "option name")
-        table = page.build_table(head, rows, caption="Optical effects of the scene")
-        yield page.Collapsible(title, [table])
+        yield page.build_table(head, rows, caption=title)
 
 
 def _effect_row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:

@@ -64,13 +64,11 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         yield page.Plots(_draw(quantity, own))
         if len(own) > 1:
             rows_of_parts = [(describe_part(x), *_cells(x)) for x in own]
-            table = page.build_table(PART_COLUMNS, rows_of_parts, caption=quantity)
-            yield page.Collapsible("Table by skin type, age of the calibration and ISO", [table])
+            caption = f"{quantity} by skin type, age of the calibration and ISO"
+            yield page.build_table(PART_COLUMNS, rows_of_parts, caption=caption)
     if failed:
-        table = page.build_table(
-            ("case", "error"), [(one["case"], one["error"]) for one in failed], caption="Failures"
-        )
-        yield page.Collapsible(f"{len(failed)} cases failed", [table])
+        cases = [(one["case"], one["error"]) for one in failed]
+        yield page.build_table(("case", "error"), cases, caption=f"{len(failed)} cases failed")
 
 
 def _count_verdicts(rows: Sequence[Mapping[str, Any]]) -> str:
