@@ -1,4 +1,4 @@
-"""Make ``docs/images/rig-*.svg``: a labeled drawing of each rig, to scale from its rig file.
+"""Make ``rig-*.svg`` for docs and reports: a drawing of each rig, to scale from its rig file.
 
 Usage: python tools/make_rig_drawings.py
 """
@@ -9,7 +9,7 @@ from xml.sax.saxutils import escape
 
 from capture.rig import Rig, load_rig
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs/images"
+FOLDERS = [Path(__file__).resolve().parents[1] / name for name in ("docs/images", "skinrig/data")]
 INK, LIGHT, CAMERA, SKIN, FILTER = "#333", "#e0a100", "#2b5c9e", "#d9a58b", "#7a3fa0"
 
 
@@ -55,7 +55,8 @@ class Drawing:
 
     def save(self, name: str) -> None:
         text = "\n".join([*self.parts, "</svg>", ""])
-        (IMAGES / f"rig-{name}.svg").write_text(text, encoding="utf-8")
+        for folder in FOLDERS:
+            (folder / f"rig-{name}.svg").write_text(text, encoding="utf-8")
 
 
 def _number(value: object) -> str:

@@ -1,5 +1,6 @@
 // Opens an image of the report in full size, with a second image of its group and the values
-// under the pointer. Values are read from the colors of the page's own images and color bars.
+// under the pointer or a point that arrow keys move. Values are read from the colors of the page's
+// own images and color bars.
 "use strict";
 (() => {
   const MASKED_GRAY = Number(document.currentScript.dataset.maskedGray);
@@ -7,6 +8,8 @@
   const FOREIGN_COLOR = 400; // squared distance in 8-bit sRGB beyond which a color is not of the bar
 
   const IMAGES = 'img, a[href^="#image-"]';
+  const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+  const FAST_STEP_PX = 10; // with the shift key
 
   const make = (tag, attributes = {}, ...children) => {
     const element = document.createElement(tag);
@@ -65,7 +68,11 @@
   };
 
   const open = (chosen) => {
-    const group = [...chosen.closest(".maps, .pair").querySelectorAll(IMAGES)].map(describe);
+    // drawings of rigs are compared with no image
+    const isDrawing = ({ image }) => image.src.startsWith("data:image/svg");
+    const group = [...chosen.closest(".maps, .pair").querySelectorAll(IMAGES)]
+      .map(describe)
+      .filter((one, _, all) => isDrawing(one) === isDrawing(all.find(({ part }) => part === chosen)));
     const names = group.map((one) => one.title);
     const first = group.findIndex((one) => one.part === chosen);
     const select = (label, index) => {
@@ -83,7 +90,8 @@
     const gainWords = make("label", { class: "gain" }, "Difference: off ", gain);
     const difference = make("canvas", { class: "difference", role: "img" });
     const bar = make("div");
-    const stage = make("div", { class: "stage" });
+    const point = make("div", { class: "point" });
+    const stage = make("div", { class: "stage", tabindex: 0, role: "group", "aria-label": "Image: arrow keys read its values" });
     const close = make("button", { type: "button" }, "Close");
     const dialog = make("dialog", { class: "enlarged", "aria-label": names[first] });
     const controls = make("div", { class: "controls" }, left);
@@ -98,12 +106,20 @@
       stage.replaceChildren(
         make("img", { src: b.image.src, alt: b.image.alt }),
         make("img", { src: a.image.src, alt: a.image.alt, class: "over" }),
+        point,
       );
       stage.style.setProperty("--divider", `${divider.value}%`);
       stage.style.setProperty("--aspect", a.image.naturalWidth / a.image.naturalHeight);
       subtract(a, b);
-      bar.replaceChildren(...(a.scale ? [a.scale.parentElement.cloneNode(true)] : []));
-      values.textContent = "Move the pointer over the image for its values.";
+      const scales = new Map([b, a].filter((one) => one.scale).map((one) => [one.scale.parentElement.outerHTML, one]));
+      bar.replaceChildren(
+        ...[...scales.values()].reverse().map((one) => {
+          const copy = one.scale.parentElement.cloneNode(true);
+          if (scales.size > 1) copy.prepend(make("span", {}, one.title));
+          return copy;
+        }),
+      );
+      values.textContent = "Move the pointer over the image, or press arrow keys on it, for its values.";
     };
     // left minus right in sRGB, times the gain, around gray
     const subtract = (a, b) => {
@@ -150,15 +166,30 @@
       stop();
       subtract(...shown());
     });
-    stage.addEventListener("pointermove", (event) => {
-      const box = stage.getBoundingClientRect();
-      const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+    let probed = [0.5, 0.5]; // fractions of the width and height
+    const probe = (u, v) => {
+      probed = [u, v];
+      stage.style.setProperty("--u", `${100 * u}%`);
+      stage.style.setProperty("--v", `${100 * v}%`);
       const texts = [...new Set(shown())].map(({ image, read, title }) => {
         const [w, h] = [image.naturalWidth, image.naturalHeight];
         const [x, y] = [Math.min(w - 1, Math.floor(u * w)), Math.min(h - 1, Math.floor(v * h))];
         return `${title}: ${x < 0 || y < 0 ? "" : read(x, y)}`;
       });
       values.textContent = texts.join("; ");
+    };
+    stage.addEventListener("pointermove", (event) => {
+      const box = stage.getBoundingClientRect();
+      probe((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+    });
+    stage.addEventListener("keydown", (event) => {
+      const step = ARROWS[event.key];
+      if (!step) return;
+      event.preventDefault();
+      const { naturalWidth, naturalHeight } = shown()[0].image;
+      const fast = event.shiftKey ? FAST_STEP_PX : 1;
+      const center = (size, at, by) => (Math.min(size - 1, Math.max(0, Math.floor(at * size) + fast * by)) + 0.5) / size;
+      probe(center(naturalWidth, probed[0], step[0]), center(naturalHeight, probed[1], step[1]));
     });
     for (const field of [left, right]) field.addEventListener("change", draw);
     divider.addEventListener("input", () => {

@@ -188,18 +188,14 @@ def _drawn(
     if title.endswith("green"):
         shown = [(label, image[..., 1], mask) for label, image, mask in shown]
     if shown[0][1].ndim == 3:
-        bright = max(float(np.percentile(shown[0][1][shown[0][2]], 99.5)), 1e-9)
+        white = map_images.find_white(*shown[0][1:])
         draw = [
             map_images.draw_color_image(
-                label,
-                np.where(mask[..., None], image / bright, map_images.GRAY_LINEAR),
-                width=WIDTH_PX,
-                of=title,
-                lossy=True,
+                label, map_images.expose(image, mask, white), width=WIDTH_PX, of=title, lossy=True
             )
             for label, image, mask in shown
         ]
-        return draw, f"linear RGB, white: {bright:.2g}"
+        return draw, f"linear RGB, white: {white:.2g}"
     ends = map_images.compute_shared_range([image[mask] for _, image, mask in shown])
     low, high = (float(f"{end:.2g}") for end in ends)
     colors = "gray" if title == CAPTURED_IMAGE else "viridis"

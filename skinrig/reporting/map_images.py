@@ -12,8 +12,10 @@ from skinrig.reporting import map_names, page
 from skinrig.reporting.page import format_number
 from skinrig.unit_format import format_quantity
 
-GRAY_LINEAR = float(png.INVALID_GRAY / 255.0) ** 2.2
-"""Linear value of the gray of pixels without a value."""
+GRAY_LINEAR = ((png.INVALID_GRAY / 255.0 + 0.055) / 1.055) ** 2.4
+"""Linear value of the gray of pixels without a value, by the sRGB curve."""
+WHITE_PERCENTILE = 99.5
+"""Percentile of the valid values of an image that is drawn as white."""
 OUTER_FENCE = 3.0
 """Interquartile ranges from the quartiles to Tukey's outer fences (Tukey 1977)."""
 SCALE_COLORS = 128
@@ -115,6 +117,16 @@ def _summary(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     return (
         f"median {format_quantity(format_number(median), unit)}, {within}{_describe_missing(shown)}"
     )
+
+
+def find_white(linear: FloatArray, valid: BoolArray) -> float:
+    """Return the value that is drawn as white; ``valid``, (H, W), holds a pixel at least."""
+    return max(float(np.percentile(linear[valid], WHITE_PERCENTILE)), 1e-9)
+
+
+def expose(linear: FloatArray, valid: BoolArray, white: float) -> Float64Array:
+    """Return an image, (H, W, 3), with ``white`` at 1; pixels that are not valid are gray."""
+    return np.where(valid[..., None], linear / white, GRAY_LINEAR)
 
 
 def draw_color_image(

@@ -112,6 +112,8 @@ class Heading(Block):
 
     text: str
     level: int = 3
+    folder: str = ""
+    """Name of the folder of the results, in small letters below a heading of level 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +242,7 @@ class Part:
     anchor: str
     title: str
     blocks: list[Block]
+    folder: str = ""
 
 
 def format_number(value: float) -> str:
@@ -414,7 +417,8 @@ def _parts(blocks: Iterable[Block], taken: set[str]) -> list[Part]:
     parts = [Part("", "", [])]
     for block in blocks:
         if isinstance(block, Heading) and block.level == 2:
-            parts.append(Part(_anchor(block.text, taken), block.text, []))
+            anchor = _anchor(f"{block.text} {block.folder}", taken)
+            parts.append(Part(anchor, block.text, [], block.folder))
         else:
             parts[-1].blocks.append(block)
     return parts

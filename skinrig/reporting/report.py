@@ -7,18 +7,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from capture.session import Session
 from model import store
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import hash_file, is_fused
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.evaluating.session_agreement import SessionAgreement
-from skinrig.reporting import first_screen, map_images, page, provenance, repeating
+from skinrig.reporting import chapter, first_screen, page, provenance, repeating
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
 from skinrig.reporting.drawn_sections import DrawnSections
 from skinrig.reporting.folders import ReportError, ReportInputs, discover, read_json
-from skinrig.reporting.map_names import map_title
 from skinrig.reporting.sections import (
     bench,
     calibration,
@@ -239,18 +239,25 @@ def _maps(
         subject = page.ReportedAppearance(name, appearance, None, [], again)
         documents = [found.appearances[name], *_name_truths(appearance, found)]
         digests = (hash_file(folder / store.DOCUMENT_FILE) for folder in documents)
-        yield from drawn.draw((name, again, *digests), partial(_add_checks, draw, subject), checks)
+        captured = repeating.find_session(appearance, found)
+        contents = name, again, captured and captured.content_hash, *digests
+        draw = partial(_draw_chapter, draw, subject, captured)
+        yield from drawn.draw(contents, draw, checks)
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
 
 
-def _add_checks(
+def _draw_chapter(
     draw: Callable[[page.ReportedAppearance], Iterator[page.Block]],
     subject: page.ReportedAppearance,
+    captured: Session | None,
     checks: list[page.Check],
 ) -> Iterator[page.Block]:
-    """Draw the section of an appearance, and add its checks to a list."""
-    return draw(replace(subject, checks=checks))
+    """Draw the section of an appearance, and add its checks to an empty list."""
+    subject = replace(subject, checks=checks)
+    body = list(draw(subject))  # its checks are in the head
+    yield from chapter.draw_head(subject, captured)
+    yield from body
 
 
 def _name_truths(appearance: SkinAppearance, found: ReportInputs) -> list[Path]:
@@ -283,19 +290,10 @@ def _appearance_section(
     appearance = subject.appearance
     truth = found.find_truth(appearance)
     subject = replace(subject, truth=truth)
-    kind = "Fused person" if is_fused(appearance) else "Maps"
-    yield page.Heading(f"{kind}: {subject.name}", level=2)
     if is_fused(appearance):
         yield from fused.section(appearance)
         appearance = fused.without_copies(appearance)
         subject = replace(subject, appearance=appearance)
-    images = [
-        map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
-        for key in ("image", "specular_image")
-        if key in appearance.maps and appearance.maps[key].values.any()
-    ]
-    if images:
-        yield page.Images(images)
     if "position" in appearance.maps:
         yield from surface_section.section(subject)
     elif microrelief.is_microrelief(appearance):
@@ -321,7 +319,6 @@ def _dynamic_section(subject: page.ReportedAppearance, found: ReportInputs) -> I
         for state, folder in part.get("truth", {}).items()
         if folder in found.truths
     }
-    yield page.Heading(f"Moving face: {subject.name}", level=2)
     yield from dynamic.section(subject, truths)
     if not truths:
         yield from verdict_section.build_uncertainty_blocks(appearance)

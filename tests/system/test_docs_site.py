@@ -132,12 +132,14 @@ def test_rig_drawings_match_their_rig_files(tmp_path, monkeypatch):
     spec = importlib.util.spec_from_file_location("drawings", ROOT / "tools/make_rig_drawings.py")
     drawings = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(drawings)
-    monkeypatch.setattr(drawings, "IMAGES", tmp_path)
+    folders = drawings.FOLDERS
+    monkeypatch.setattr(drawings, "FOLDERS", [tmp_path])
     drawings.main()
     made = sorted(tmp_path.iterdir())
     assert len(made) == 4
     for path in made:
-        assert path.read_text("utf-8") == (DOCS / "images" / path.name).read_text("utf-8")
+        for folder in folders:
+            assert path.read_text("utf-8") == (folder / path.name).read_text("utf-8")
 
 
 def test_gallery_images_are_small_and_scripted():

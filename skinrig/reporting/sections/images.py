@@ -41,7 +41,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
     document = json.loads(path.read_text(encoding="utf-8"))
     if not str(document.get("schema", "")).startswith(SCHEMA_PREFIXES):
         return
-    yield page.Heading(f"{_heading(document)}: {folder.name}", level=2)
+    yield page.Heading(_heading(document), 2, folder.name)
     if FULL_MODEL in document:
         yield from _comparison(folder.name, document, checks)
     elif "view" in document:

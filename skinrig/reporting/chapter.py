@@ -1,0 +1,148 @@
+"""Draw the head of a set of maps: its title, weakest result, rig and a captured image."""
+
+import base64
+import html
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from importlib import resources
+from typing import Final
+
+import numpy as np
+
+from capture import raw
+from capture.session import Session, SessionError
+from model.skin import SkinAppearance
+from skinrig.appearances.contents import is_fused
+from skinrig.appearances.dynamic import describe_parts
+from skinrig.reporting import map_images, page, verdict
+from skinrig.reporting.map_names import map_title
+from skinrig.reporting.sections import dynamic, microrelief, sequence, subsurface
+from skinrig.unit_format import format_quantity
+
+RIG_TITLES: Final = {
+    "flash": "Flash rig",
+    "dome": "Light dome",
+    "gradient": "Gradient rig",
+    "probe": "Fiber probe",
+}
+_VIEW_BOX: Final = re.compile(r'viewBox="0 0 (\d+) (\d+)"')
+_UNUSED_NOISE: Final = {"gain": 1.0, "read_noise": 1.0}
+"""Only the values of an image are drawn; their variance is not."""
+
+
+def draw_head(subject: page.ReportedAppearance, session: Session | None) -> Iterator[page.Block]:
+    """Yield the title, the weakest result, the drawing of the rig and captured images.
+
+    Parameters
+    ----------
+    subject
+        With the checks of its section.
+    session
+        Session that the maps were reconstructed from; None: not found.
+    """
+    appearance = subject.appearance
+    rig = "" if session is None or is_fused(appearance) else session.rig.name
+    title = _name_contents(appearance)
+    title = f"{RIG_TITLES[rig]}: {title}" if rig in RIG_TITLES else title[:1].upper() + title[1:]
+    yield page.Heading(title, 2, subject.name)
+    if sentence := describe_weakest(subject.name, subject.checks, appearance):
+        yield page.Paragraph(sentence)
+    images = [_draw_rig(rig)] if rig in RIG_TITLES else []
+    if not is_fused(appearance):
+        images += _draw_captured(appearance, session)
+    if images:
+        yield page.Images(images)
+
+
+def _name_contents(appearance: SkinAppearance) -> str:
+    if dynamic.is_dynamic(appearance):
+        has_color = "facial_color" in describe_parts(appearance)
+        return f"moving face: {'skin color by expression' if has_color else 'surface by strain'}"
+    if is_fused(appearance):
+        return "fused person: maps of all rigs"
+    if "position" in appearance.maps:
+        return "normals and reflectance"
+    if microrelief.is_microrelief(appearance):
+        return "surface topography by strain"
+    if subsurface.is_probe(appearance):
+        return "subsurface scattering"
+    if sequence.is_sequence(appearance):
+        return "blood in time"
+    return "melanin and blood" if "melanin" in appearance.maps else "maps"
+
+
+def describe_weakest(name: str, checks: Sequence[page.Check], appearance: SkinAppearance) -> str:
+    """Return the check nearest to its limit; without checks, the least certain map.
+
+    Parameters
+    ----------
+    name
+        Of the appearance.
+    checks
+        Checks of its section.
+    appearance
+        Its maps.
+
+    Examples
+    --------
+    >>> bare = SkinAppearance({}, "measured")
+    >>> kept = page.Check("face: normals, mean error", 1.3, 2.0, "<=", "°", worst="nose: 1.6°")
+    >>> describe_weakest("face", [kept], bare)
+    'Weakest result: normals, mean error, 1.3° (limit 2°); largest for nose: 1.6°.'
+    >>> describe_weakest("face", [], bare)
+    ''
+    """
+    if not checks:
+        uncertain = verdict.list_least_certain(name, appearance)
+        return f"Least certain: {uncertain[0].removeprefix(f'{name}: ')}." if uncertain else ""
+    weakest = max(checks, key=lambda one: (not one.passed, one.used if one.used > 0.0 else 0.0))
+    got, bound = (
+        format_quantity(page.format_number(one), weakest.unit)
+        for one in (weakest.got, weakest.bound)
+    )
+    what = weakest.name.removeprefix(f"{name}: ")
+    label = "Weakest result" if weakest.passed else "Limit missed"
+    where = f"; largest for {weakest.worst}" if weakest.worst else ""
+    return f"{label}: {what}, {got} (limit {bound}){where}.".replace(" %", "\N{NO-BREAK SPACE}%")
+
+
+def _draw_rig(rig: str) -> page.Image:
+    """Return the drawing of a packaged rig."""
+    text = resources.files("skinrig").joinpath(f"data/rig-{rig}.svg").read_text(encoding="utf-8")
+    (width, height), title = _VIEW_BOX.findall(text)[0], re.findall("<title>(.*?)</title>", text)[0]
+    address = f"data:image/svg+xml;base64,{base64.b64encode(text.encode()).decode()}"
+    caption = f"{RIG_TITLES[rig]}, standard layout"
+    return page.Image(caption, address, html.unescape(title), (int(width), int(height)))
+
+
+def _draw_captured(appearance: SkinAppearance, session: Session | None) -> list[page.Image]:
+    """Return the images among the maps; without them, a frame of the session."""
+    drawn = []
+    for key in ("image", "specular_image"):
+        one = appearance.maps.get(key)
+        if one is not None and one.mask.any() and one.values.any():
+            white = map_images.find_white(one.values, one.mask)
+            shown = map_images.expose(one.values, one.mask, white)
+            title = f"{map_title(key)}, linear RGB, white: {white:.2g}"
+            drawn.append(map_images.draw_color_image(title, shown))
+    if not drawn and session is not None:
+        with suppress(SessionError, raw.RawError, OSError):
+            drawn.append(_draw_frame(session))
+    return drawn
+
+
+def _draw_frame(session: Session) -> page.Image:
+    """Return the lit frame in the middle of a session, at its own exposure."""
+    lit = [record for record in session.frames() if record.kind != "dark"]
+    record = lit[len(lit) // 2]
+    frame = session.read(record)
+    if frame.pattern == "MONO":
+        values, _, _ = raw.linear_mono(frame, **_UNUSED_NOISE)
+        linear = np.repeat(values[..., None], 3, axis=-1)
+    else:
+        linear = raw.linear_rgb(frame, demosaic="centered", **_UNUSED_NOISE).rgb
+        linear = linear / np.asarray(frame.neutral or (1.0, 1.0, 1.0), np.float32)
+    white = map_images.find_white(linear, np.ones(linear.shape[:2], bool))
+    title = f"captured frame {record.step_id}, camera {record.camera}, white: {white:.2g}"
+    return map_images.draw_color_image(title, linear / white, lossy=True)
