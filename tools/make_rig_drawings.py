@@ -4,6 +4,7 @@ Usage: python tools/make_rig_drawings.py
 """
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -38,6 +39,16 @@ class Drawing:
 
     def dot(self, at: tuple[float, float], r: float, fill: str, **style: object) -> None:
         self.add("circle", cx=at[0], cy=at[1], r=r, fill=fill, **style)
+
+    def dots(
+        self, places: Iterable[tuple[float, float]], r: float, fill: str, **style: object
+    ) -> None:
+        """Draw dots of one style, which is written once: reports embed the file."""
+        self.add("g", fill=fill, **style)
+        self.parts[-1] = self.parts[-1].replace("/>", ">")
+        for x, y in places:
+            self.add("circle", cx=x, cy=y, r=r)
+        self.parts.append("</g>")
 
     def box(
         self, center: tuple[float, float], w: float, h: float, fill: str, **style: object
@@ -137,15 +148,9 @@ def draw_dome(rig: Rig) -> Drawing:
     ):
         drawing.heading((origin[0] - 170, 28), title)
         _face(drawing, origin, 40 if axis == 0 else 44, 54)
-        for light in rig.lights:
-            p = light.position_mm
-            drawing.dot(
-                (origin[0] + scale * p[axis], origin[1] - scale * p[1]),
-                3.2,
-                LIGHT,
-                stroke=INK,
-                stroke_width=0.5,
-            )
+        at = [light.position_mm for light in rig.lights]
+        places = [(origin[0] + scale * p[axis], origin[1] - scale * p[1]) for p in at]
+        drawing.dots(places, 3.2, LIGHT, stroke=INK, stroke_width=0.5)
         for view in rig.views:
             p = view.position_mm
             drawing.box(
@@ -178,16 +183,9 @@ def draw_gradient(rig: Rig) -> Drawing:
     )
     scale, origin = 0.27, (200.0, 215.0)
     drawing.heading((20, 28), "Sphere, from the side")
-    for light in rig.lights:
-        p = light.position_mm
-        drawing.dot(
-            (origin[0] + scale * p[2], origin[1] - scale * p[1]),
-            3.6,
-            LIGHT,
-            stroke=INK,
-            stroke_width=0.5,
-            opacity=0.45,
-        )
+    at = [light.position_mm for light in rig.lights]
+    places = [(origin[0] + scale * p[2], origin[1] - scale * p[1]) for p in at]
+    drawing.dots(places, 3.6, LIGHT, stroke=INK, stroke_width=0.5, opacity=0.45)
     camera = (origin[0] + scale * rig.views[0].position_mm[2], origin[1])
     drawing.line(origin, camera, stroke=CAMERA)
     drawing.box(camera, 34, 24, CAMERA, stroke=INK)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from capture import raw
-from capture.session import Session, SessionError
+from capture.session import FrameRecord, Session, SessionError
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import describe_parts
@@ -118,24 +118,24 @@ def _draw_rig(rig: str) -> page.Image:
 
 def _draw_captured(appearance: SkinAppearance, session: Session | None) -> list[page.Image]:
     """Return the images among the maps; without them, a frame of the session."""
-    drawn = []
+    drawn: list[page.Image] = []
+    white = 0.0
     for key in ("image", "specular_image"):
         one = appearance.maps.get(key)
         if one is not None and one.mask.any() and one.values.any():
-            white = map_images.find_white(one.values, one.mask)
+            white = white or map_images.find_white(one.values, one.mask)
             shown = map_images.expose(one.values, one.mask, white)
             title = f"{map_title(key)}, linear RGB, white: {white:.2g}"
             drawn.append(map_images.draw_color_image(title, shown))
-    if not drawn and session is not None:
+    lit = [] if session is None else [one for one in session.frames() if one.kind != "dark"]
+    if session is not None and lit and not drawn:
         with suppress(SessionError, raw.RawError, OSError):
-            drawn.append(_draw_frame(session))
+            drawn.append(_draw_frame(session, lit[len(lit) // 2]))
     return drawn
 
 
-def _draw_frame(session: Session) -> page.Image:
-    """Return the lit frame in the middle of a session, at its own exposure."""
-    lit = [record for record in session.frames() if record.kind != "dark"]
-    record = lit[len(lit) // 2]
+def _draw_frame(session: Session, record: FrameRecord) -> page.Image:
+    """Return a frame of a session at its own exposure."""
     frame = session.read(record)
     if frame.pattern == "MONO":
         values, _, _ = raw.linear_mono(frame, **_UNUSED_NOISE)

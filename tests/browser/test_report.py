@@ -21,6 +21,8 @@ from skinrig.reporting.page import Image, Images, render_page
 from skinrig.reporting.status import build_status_page, read_status
 
 WIDTHS = (1250, 400)
+MAX_HEIGHT_PX = 4000
+"""Of the report on one run, at 1280 px width."""
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +143,18 @@ def test_first_screen_shows_images_below_the_verdict(browser, pages, width):
 
 
 @pytest.mark.long
+def test_report_of_one_run_is_short(browser, pages):
+    """Tables and plots below the checks are folded, so that images follow each other."""
+    context, page, _ = opened(browser, pages[0], width=1280)
+    height = "document.documentElement.scrollHeight"
+    folded = page.evaluate(height)
+    assert folded < MAX_HEIGHT_PX
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    assert page.evaluate(height) > MAX_HEIGHT_PX
+    context.close()
+
+
+@pytest.mark.long
 def test_enlarged_image_reads_values_of_map(browser, pages):
     """Rationale: values come from colors alone; the map rises from 0.02 to 0.12 row by row.
 
@@ -158,6 +172,15 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
         text = dialog.locator("output").text_content()
         found.append(float(re.search(r"ground truth: ≈ ([0-9.]+)", text)[1]))
     np.testing.assert_allclose(found, expected, atol=0.1 / 64)
+    # the keyboard reads the row above, and stays inside of the image
+    dialog.locator(".stage").focus()
+    for key in ("ArrowUp", "Shift+ArrowLeft", *["Shift+ArrowDown"] * 12):
+        page.keyboard.press(key)
+        text = dialog.locator("output").text_content()
+        found.append(float(re.search(r"ground truth: [≈≥] ([0-9.]+)", text)[1]))
+    assert found[2] == pytest.approx(found[1] - 0.1 / 120, abs=0.1 / 64)
+    assert found[-1] == pytest.approx(0.12, abs=0.1 / 64)
+    # two color scales: the map's, and that of its error
     before = dialog.locator(".stage").screenshot()
     dialog.get_by_role("slider", name="divider").fill("100")
     assert dialog.locator(".stage").screenshot() != before

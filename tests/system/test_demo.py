@@ -152,7 +152,7 @@ def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, wit
     assert len(report.encode()) <= MAX_REPORT_BYTES
     # the finished face is the last chapter of the maps, with a sheet of its own
     last = report.index('<h2 id="the-finished-face">')
-    assert last > report.rindex('<h2 id="maps-')
+    assert last > report.rindex('<h2 id="light-dome-')
     assert report[last:].index("data:image/webp") < report[last:].index("</section>")
     assert "blood volume fraction of anger" in report[last:]
     errors = {(subject, name): error for subject, name, error, *_ in document["errors"]}
@@ -167,7 +167,7 @@ def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, wit
         f"session-dome-{name}" for name in ("charuco", "mirror", "white", "III")
     }
     assert not list(out.glob("*gradient*"))
-    assert "Fused person: double" in report
+    assert "Fused person: maps of all rigs <small>double</small>" in report
     assert set(store.read(out / "double").parameters["fusion"]["maps"]["melanin"]) == {
         "dome",
         "flash",

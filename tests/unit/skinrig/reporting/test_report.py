@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 import shutil
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from reconstruction.pipeline.graph import UNWANTED_REASON
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
@@ -29,7 +31,7 @@ def folder(tmp_path, rng):
             "simulated",
             parameters={"truth": "truth-flash", "assumed": ["<b>flat</b> light"]},
             inputs={"session": "0123456789abcdef0123"},
-            left_out=(("tsumura", "not wanted"),),
+            left_out=(("tsumura", "not wanted"), ("monk", UNWANTED_REASON)),
         ),
     )
     maps = {
@@ -53,6 +55,23 @@ def test_page_is_reproducible_and_requests_nothing(folder):
     assert "default-src 'none'" in html
     assert "http://" not in html.replace("http://www.w3.org", "")
     assert html.count("<script") == 1
+
+
+def test_tables_below_checks_are_folded(folder):
+    html = report.build([folder])
+    unfolded = re.sub("<details>.*?</details>", "", html, flags=re.DOTALL)
+    captions = re.findall("<caption[^>]*>([^<]*)", unfolded)
+    assert [one.split(",")[0] for one in captions] == [
+        "Missed limits",
+        "Measured values and limits",
+    ]
+    assert html.count("<table") >= len(captions) + 4
+
+
+def test_stages_that_nobody_requested_are_not_listed(folder):
+    html = report.build([folder])
+    assert "tsumura" in html
+    assert "monk" not in html
 
 
 def test_sections_of_unchanged_maps_are_not_redrawn(folder, monkeypatch):

@@ -71,7 +71,7 @@ def test_rig_with_true_blood_passes_limit_other_misses(tmp_path):
     write_truth(tmp_path / "truth", "neutral", "hemoglobin", neutral)
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 1.5 * neutral)
     page = report.build([tmp_path])
-    assert "Moving face: moving" in page
+    assert "Moving face: skin color by expression <small>moving</small>" in page
     assert "The only check kept its limit." in page
     assert "blood volume fraction of smile, by the rig" in page
     change = "change of the blood volume fraction from neutral to smile"
