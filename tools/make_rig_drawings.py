@@ -43,12 +43,9 @@ class Drawing:
     def dots(
         self, places: Iterable[tuple[float, float]], r: float, fill: str, **style: object
     ) -> None:
-        """Draw dots of one style, which is written once: reports embed the file."""
-        self.add("g", fill=fill, **style)
-        self.parts[-1] = self.parts[-1].replace("/>", ">")
-        for x, y in places:
-            self.add("circle", cx=x, cy=y, r=r)
-        self.parts.append("</g>")
+        """Draw many dots as one path of round caps: reports embed the file."""
+        path = "".join(f"M{_number(x)} {_number(y)}h0" for x, y in places)
+        self.add("path", d=path, stroke=fill, stroke_width=2 * r, stroke_linecap="round", **style)
 
     def box(
         self, center: tuple[float, float], w: float, h: float, fill: str, **style: object
@@ -150,7 +147,7 @@ def draw_dome(rig: Rig) -> Drawing:
         _face(drawing, origin, 40 if axis == 0 else 44, 54)
         at = [light.position_mm for light in rig.lights]
         places = [(origin[0] + scale * p[axis], origin[1] - scale * p[1]) for p in at]
-        drawing.dots(places, 3.2, LIGHT, stroke=INK, stroke_width=0.5)
+        drawing.dots(places, 3.2, LIGHT)
         for view in rig.views:
             p = view.position_mm
             drawing.box(
@@ -185,7 +182,7 @@ def draw_gradient(rig: Rig) -> Drawing:
     drawing.heading((20, 28), "Sphere, from the side")
     at = [light.position_mm for light in rig.lights]
     places = [(origin[0] + scale * p[2], origin[1] - scale * p[1]) for p in at]
-    drawing.dots(places, 3.6, LIGHT, stroke=INK, stroke_width=0.5, opacity=0.45)
+    drawing.dots(places, 3.2, LIGHT, opacity=0.5)
     camera = (origin[0] + scale * rig.views[0].position_mm[2], origin[1])
     drawing.line(origin, camera, stroke=CAMERA)
     drawing.box(camera, 34, 24, CAMERA, stroke=INK)

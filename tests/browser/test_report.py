@@ -21,7 +21,7 @@ from skinrig.reporting.page import Image, Images, render_page
 from skinrig.reporting.status import build_status_page, read_status
 
 WIDTHS = (1250, 400)
-MAX_HEIGHT_PX = 4000
+MAX_HEIGHT_PX = 3000
 """Of the report on one run, at 1280 px width."""
 
 
@@ -180,7 +180,12 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
         found.append(float(re.search(r"ground truth: [≈≥] ([0-9.]+)", text)[1]))
     assert found[2] == pytest.approx(found[1] - 0.1 / 120, abs=0.1 / 64)
     assert found[-1] == pytest.approx(0.12, abs=0.1 / 64)
-    # two color scales: the map's, and that of its error
+    # maps of one color scale share a bar; the error has its own
+    assert dialog.locator(".bar").count() == 1
+    right = dialog.get_by_role("combobox").nth(1)
+    right.select_option(label="estimate − ground truth")
+    assert dialog.locator(".bar").count() == 2
+    right.select_option("1")
     before = dialog.locator(".stage").screenshot()
     dialog.get_by_role("slider", name="divider").fill("100")
     assert dialog.locator(".stage").screenshot() != before

@@ -56,7 +56,7 @@ def test_comparison_adds_limit_and_names_omissions(tmp_path):
 def test_report_finds_images_below_its_folder(tmp_path):
     a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={"L017": 1}, lobes=4)
     html = build([tmp_path])
-    assert "Rendering: pictures" in html
+    assert "Rendering <small>pictures</small>" in html
     assert "L017" in html
 
 
