@@ -15,6 +15,7 @@ from capture.session import FrameRecord, Session, SessionError
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import describe_parts
+from skinrig.arrays import FloatArray
 from skinrig.reporting import map_images, page, verdict
 from skinrig.reporting.map_names import map_title
 from skinrig.reporting.sections import dynamic, microrelief, sequence, subsurface
@@ -139,10 +140,10 @@ def _draw_frame(session: Session, record: FrameRecord) -> page.Image:
     frame = session.read(record)
     if frame.pattern == "MONO":
         values, _, _ = raw.linear_mono(frame, **_UNUSED_NOISE)
-        linear = np.repeat(values[..., None], 3, axis=-1)
+        linear: FloatArray = np.repeat(values[..., None], 3, axis=-1)
     else:
-        linear = raw.linear_rgb(frame, demosaic="centered", **_UNUSED_NOISE).rgb
-        linear = linear / np.asarray(frame.neutral or (1.0, 1.0, 1.0), np.float32)
+        balance: FloatArray = np.array(frame.neutral or (1.0, 1.0, 1.0), np.float32)
+        linear = raw.linear_rgb(frame, demosaic="centered", **_UNUSED_NOISE).rgb / balance
     white = map_images.find_white(linear, np.ones(linear.shape[:2], bool))
     title = f"captured frame {record.step_id}, camera {record.camera}, white: {white:.2g}"
     return map_images.draw_color_image(title, linear / white, lossy=True)
