@@ -58,6 +58,11 @@ class EndToEndCase:
     budgets_s: Mapping[int | None, tuple[float, ...]]
     by_coverage: bool = False
 
+    def shorten(self) -> "EndToEndCase":
+        """Return the case of the first person at the smallest budget of the first width."""
+        width, budgets_s = next(iter(self.budgets_s.items()))
+        return EndToEndCase(self.people[:1], {width: (min(budgets_s),)}, self.by_coverage)
+
 
 CASES: Final[Mapping[str, EndToEndCase]] = {
     # forecasts have their knee at 32 to 34 s: one plan before it, one at it, one beyond
@@ -121,16 +126,22 @@ def spread_ratio(logs: ArrayLike) -> float:
 
 def measure_end_to_end(stage: BenchmarkStage) -> Iterator[None]:
     """Measure one curve per rig and map, one rig after the other."""
-    cases: Mapping[str, EndToEndCase] = {"flash": TOY_CASE} if stage.toy else CASES
-    if stage.selection:
-        require_choice("--end-to-end", stage.selection, CASES)
-        cases = {stage.selection: cases[stage.selection]}
-    for rig_name, case in cases.items():
+    for rig_name, case in _select_cases(stage).items():
         begin = len(stage.points)
         for points in _measure_case(rig_name, case):
             del stage.points[begin:]  # those of fewer people
             _add_curves(stage, rig_name, points, by_coverage=case.by_coverage)
             yield
+
+
+def _select_cases(stage: BenchmarkStage) -> Mapping[str, EndToEndCase]:
+    """Return the cases by rig: at toy size of one person, and of the flash rig by default."""
+    if stage.selection:
+        require_choice("--end-to-end", stage.selection, CASES)
+    if not stage.toy:
+        return {stage.selection: CASES[stage.selection]} if stage.selection else CASES
+    name = stage.selection or "flash"
+    return {name: TOY_CASE if name == "flash" else CASES[name].shorten()}
 
 
 def _add_curves(

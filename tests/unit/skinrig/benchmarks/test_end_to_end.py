@@ -99,6 +99,21 @@ def test_knee_of_each_curve_is_in_report(monkeypatch, tmp_path, is_flat):
     assert "seconds from planning to maps" in page
 
 
+@pytest.mark.parametrize("rig", end_to_end.CASES)
+def test_smoke_run_measures_selected_rig(monkeypatch, rig):
+    asked = []
+
+    def measure_case(name, case):
+        asked.append((name, len(case.people), [len(one) for one in case.budgets_s.values()]))
+        return [measured_case((0.5,), 1.0)]
+
+    monkeypatch.setattr(end_to_end, "_measure_case", measure_case)
+    stage = BenchmarkStage("end-to-end", toy=True, smoke=True, selection=rig)
+    list(end_to_end.measure_end_to_end(stage))
+    assert asked == [(rig, 1, [2 if rig == "flash" else 1])]
+    assert stage.to_benchmark().points[0].knobs["rig"] == rig
+
+
 def test_interrupted_run_keeps_persons_measured_before(monkeypatch):
     one, two = measured_case((0.5,), 1.0), measured_case((0.5, 1.5), 1.0)
     monkeypatch.setattr(end_to_end, "_measure_case", lambda *_: iter([one, two]))
