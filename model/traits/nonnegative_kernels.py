@@ -6,12 +6,15 @@ Problems, chapter 23), started from the positive weights.
 
 # mypy: allow-untyped-defs
 
+import logging
 import math
 
 import numpy as np
 from numba import njit, prange
 
 from model.arrays import Float64Array
+
+_log = logging.getLogger(__name__)
 
 INDEPENDENCE_TOL = 1e-12
 """A material is dependent, and not used, if its residual on those in use is below this fraction of
@@ -34,6 +37,7 @@ def nearest_mixtures(gram: Float64Array, wanted: Float64Array) -> Float64Array:
     Returns
     -------
     ndarray of float64, shape (T, K)
+        A warning counts the rows whose active sets ended at their largest number of steps.
 
     Examples
     --------
@@ -45,7 +49,14 @@ def nearest_mixtures(gram: Float64Array, wanted: Float64Array) -> Float64Array:
     beyond = np.flatnonzero((out < 0.0).any(axis=1))
     if len(beyond):
         rows = np.ascontiguousarray(out[beyond])
-        _solve_rows(np.ascontiguousarray(gram, np.float64), rows)
+        unfinished = _solve_rows(np.ascontiguousarray(gram, np.float64), rows)
+        if unfinished:
+            _log.warning(
+                "nearest mixtures: %d of %d reached the largest number of steps; the result is the "
+                "last step",
+                unfinished,
+                len(rows),
+            )
         out[beyond] = rows
     return out
 
@@ -82,6 +93,7 @@ def _back(low, used, y):
 
 @njit(cache=True, nogil=True)
 def _solve_row(gram, t, x, rhs, active, low, y, refused):
+    """Fill x; return whether its misfit cannot be reduced by another material."""
     size = len(t)
     norm = 0.0
     for p in range(size):
@@ -138,20 +150,24 @@ def _solve_row(gram, t, x, rhs, active, low, y, refused):
                 if gain > best:
                     best, entering = gain, p
         if entering < 0:
-            return
+            return True
         active[used] = entering
         used += 1
+    return False
 
 
 @njit(parallel=True, cache=True)
 def _solve_rows(gram, rows):
     count, size = rows.shape
+    unfinished = 0
     for block in prange((count + BLOCK_ROWS - 1) // BLOCK_ROWS):
         x, rhs, y = np.empty(size), np.empty(size), np.empty(size)
         active = np.empty(size, np.int64)
         low = np.empty((size, size))
         refused = np.empty(size, np.bool_)
         for row in range(block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, count)):
-            _solve_row(gram, rows[row], x, rhs, active, low, y, refused)
+            if not _solve_row(gram, rows[row], x, rhs, active, low, y, refused):
+                unfinished += 1
             for p in range(size):
                 rows[row, p] = x[p]
+    return unfinished

@@ -15,6 +15,7 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
 """
 
+import logging
 import warnings
 from dataclasses import dataclass
 from typing import Literal
@@ -28,6 +29,8 @@ from model.threads import run_in_blocks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import sample_kernels
+
+_log = logging.getLogger(__name__)
 
 MIN_SAMPLE_COSINE = 0.1
 """Least cosine of light and view of a used sample."""
@@ -210,6 +213,7 @@ def fit_weights(
     weights = np.zeros((points, basis.size))
     given = (samples.value, samples.variance, samples.light_dir, samples.view_dir, samples.normals)
     residual, stderr = np.empty((2, points))
+    ended = np.empty(points, bool)
     run_in_blocks(
         fit_points,
         points,
@@ -224,7 +228,15 @@ def fit_weights(
         weights,
         residual,
         stderr,
+        ended,
     )
+    if not ended.all():
+        _log.warning(
+            "weights of BRDFs: %d of %d points reached the largest number of steps or of materials;"
+            " compare their residuals",
+            points - np.count_nonzero(ended),
+            points,
+        )
     return BasisWeights(weights, residual, stderr, np.isfinite(residual))
 
 

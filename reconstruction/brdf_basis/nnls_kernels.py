@@ -78,7 +78,7 @@ def _cholesky(gram, rhs, active, used, low, trial):  # type: ignore[no-untyped-d
 
 @njit(nogil=True)
 def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):  # type: ignore[no-untyped-def]
-    """Minimize x' G x / 2 - rhs' x over x >= 0 by active sets, from the ``x`` given."""
+    """Minimize x' G x / 2 - rhs' x over x >= 0 by active sets from ``x``; return if it ended."""
     used = int64(0)
     for p in range(size):
         refused[p] = False
@@ -126,9 +126,10 @@ def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):
                 if gain > best:
                     best, entering = gain, p
         if entering < 0:
-            break
+            return True
         active[used] = entering
         used += 1
+    return False
 
 
 @njit(fastmath=FAST_MATH, forceinline=True)
@@ -169,7 +170,8 @@ def _solve(  # type: ignore[no-untyped-def]
     residual,
     force,
 ):
-    """Solve one weighted problem from a working set; return the new set's size."""
+    """Solve one weighted problem from a working set; return the new size, and False at a limit."""
+    ended = False
     for i in range(count):
         root[i] = math.sqrt(weight[i])
         target[i] = root[i] * value[i]
@@ -179,7 +181,7 @@ def _solve(  # type: ignore[no-untyped-def]
     norm = math.sqrt(dot(target, target, count))
     for step in range(materials + 2):
         # The first round's tolerance is coarse, as its misfit is that of the starting set
-        _minimize_active_set(
+        minimized = _minimize_active_set(
             gram, rhs, size, 1e-3 * norm if step == 0 else norm, x, active, low, trial, refused
         )
         norm = _misfit(column, x, size, target, count, residual)
@@ -219,9 +221,10 @@ def _solve(  # type: ignore[no-untyped-def]
             gather_column(rows, root, joining, count, column[size])
             size += 1
         if size == before:
+            ended = minimized
             break
         _extend_normal_equations(before, size, column, target, count, gram, rhs)
-    return size
+    return size, ended
 
 
 @njit(nogil=True)
@@ -274,6 +277,7 @@ def _update_weights(value, variance, model, count, weight, scatter):  # type: ig
         types.Array(float64, 2, "C"),
         types.Array(float64, 1, "C"),
         types.Array(float64, 1, "C"),
+        types.Array(boolean, 1, "C"),
         int64,
         int64,
     ),
@@ -295,11 +299,13 @@ def fit_points(  # type: ignore[no-untyped-def]
     weights,
     rms,
     stderr,
+    ended,
     first,
     last,
 ):
     """Fit points; fill ``weights`` (P, K), weighted RMS residuals and standard errors (P,).
 
+    ``ended`` (P,): False where the last search ended at a limit of steps or columns.
     ``reweightings`` 0: weights from the variances alone (1 where a point has none); otherwise so
     many passes weight by noise and by cube roots. ``block`` points share their working memory, and
     start from each other's columns. The standard error is that of the lobe's scale, as a fraction
@@ -349,6 +355,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                     count += 1
             weights[point, :] = 0.0
             rms[point] = stderr[point] = np.nan
+            ended[point] = True
             if count == 0:
                 continue
             top /= count
@@ -372,7 +379,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                     kept += 1
             size = kept
             x[:] = 0.0
-            size = _solve(
+            size, ended[point] = _solve(
                 rows,
                 y,
                 weight,
@@ -402,7 +409,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                     model[i] = y[i] - residual[i] / root[i]
                 scatter = _update_weights(y, var, model, count, weight, scatter)
                 weighted_column_norms(rows, weight, count, square)
-                size = _solve(
+                size, ended[point] = _solve(
                     rows,
                     y,
                     weight,

@@ -9,6 +9,7 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.1 and figure 15.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -18,9 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from model.traits.reduced_spaces import mixture_coordinates
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import fit as brdf_basis
+
+_log = logging.getLogger(__name__)
 
 Method = Literal["shares", "brdf"]
 
@@ -224,7 +228,8 @@ def refine_mixtures(
     basis
         The K materials.
     sweeps
-        Largest number of passes over all weights and mixtures.
+        Largest number of passes over all weights and mixtures; a warning states the relative
+        change of the last one if it is not below `SWEEP_TOL`.
 
     Returns
     -------
@@ -241,7 +246,7 @@ def refine_mixtures(
     shares, gram = _checked(weights, basis), brdf_inner_products(basis)
     rows = np.array(_checked(mix, basis))
     found = mixture_coordinates(shares, rows, gram)
-    last = np.inf
+    last = change = np.inf
     for _ in range(sweeps):
         products = rows @ gram
         _descend(found, shares @ products.T, products @ rows.T)
@@ -252,7 +257,10 @@ def refine_mixtures(
         left = float(np.sum(((inner @ rows - 2.0 * outer) @ gram) * rows))
         if last - left < SWEEP_TOL * abs(left):
             break
-        last = left
+        last, change = left, (last - left) / max(abs(left), 1e-300)
+    else:
+        outcome = SolverOutcome(sweeps, change, UNKNOWN_CONDITION, "limit")
+        outcome.warn_unless_converged("refinement of common mixtures", _log)
     size = rows.sum(axis=1, keepdims=True)
     even = np.full(basis.size, 1.0 / basis.size)
     return np.where(size > 0.0, rows / np.where(size > 0.0, size, 1.0), even)

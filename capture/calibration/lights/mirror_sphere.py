@@ -5,6 +5,7 @@ middle is not the center's image. Centers are therefore fitted to rays, never to
 image.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +19,8 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
+_log = logging.getLogger(__name__)
+
 N_OUTLINE_ANGLES = 180  # points on the outline where an edge is searched
 EDGE_SEARCH_RADII = 0.12  # distance from the outline, relative to its radius, in the first search
 MIN_EDGE_SEARCH_PX = 3.0
@@ -30,6 +33,8 @@ MIN_OUTLINE_EDGES = 30
 # root of the brightest over the usual background along a line across the edge
 MAX_GLARE_RATIO = 1.15
 VOTE_CELL_PX = 2.0  # cells of the search for the sphere
+MAX_SPHERE_STEPS = 30
+SPHERE_STEP_TOL_MM = 1e-7
 MAX_RADIUS_SIGMAS = 5.0
 MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius that is accepted
 
@@ -358,7 +363,7 @@ def _fit(
         return np.concatenate(parts)
 
     sigma, H = 1.0, np.eye(len(sphere))
-    for _ in range(30):
+    for _ in range(MAX_SPHERE_STEPS):
         r = residuals(sphere)
         sigma = max(mad_sigma(r), 1e-6)
         w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
@@ -370,8 +375,16 @@ def _fit(
         H = (J * w[:, None]).T @ J
         change = np.linalg.solve(H + 1e-9 * np.eye(len(H)) * np.trace(H), -J.T @ (w * r))
         sphere = sphere + change
-        if np.linalg.norm(change) < 1e-7:
+        if np.linalg.norm(change) < SPHERE_STEP_TOL_MM:
             break
+    else:
+        _log.warning(
+            "mirror sphere: not converged after %d steps; last step %.2g mm, condition %.2g; "
+            "compare the edges' noise",
+            MAX_SPHERE_STEPS,
+            np.linalg.norm(change),
+            np.linalg.cond(H),
+        )
     r = residuals(sphere)
     w = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(r), 1e-12))
     noise = float(np.sqrt((w * r**2).sum() / max(w.sum() - len(sphere), 1.0)))
