@@ -89,11 +89,17 @@ def surface_rise_factor(stretch_s: float, stretch_t: float, poisson: float) -> f
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """Convergence history of the search; entries of the tuples correspond."""
+    """Convergence history of a search that reached its tolerance; entries of the tuples correspond.
+
+    A search that stalls or reaches its limit raises `EquilibriumError` with steps, residual,
+    condition and reason.
+    """
 
     evaluations: int
     residual: float
     """Norm of the out-of-balance force over that of the affine state, preconditioned."""
+    condition: float
+    """Largest over smallest curvature along the steps, a lower bound; NaN without a step."""
     energies: tuple[float, ...] = field(repr=False)
     """Mean energy per area after each step, the affine state first."""
     residuals: tuple[float, ...] = field(repr=False)
@@ -322,9 +328,10 @@ def find_equilibrium(
     energies, residuals = [energy], [1.0]
     evaluations = 1
     pairs: Pairs = deque(maxlen=memory)
+    low, high = np.inf, np.nan  # curvatures along the steps
     # Below this the force is rounding error of the sum: already in equilibrium.
     if first < 1e-12 * (1.0 + float(problem.membrane_um.mean())):
-        return problem.state(q), Convergence(1, 0.0, (energy,), (0.0,))
+        return problem.state(q), Convergence(1, 0.0, np.nan, (energy,), (0.0,))
     for _ in range(steps):
         size = _norm(slope)
         if size <= tolerance * first:
@@ -347,19 +354,23 @@ def find_equilibrium(
             )
             if length < 1e-9:
                 raise EquilibriumError(
-                    f"residual: got {size / first:.2g}, expected {tolerance}; the energy does not "
-                    "fall any further"
+                    f"residual: got {size / first:.2g} after {len(energies) - 1} steps, expected "
+                    f"<= {tolerance}; condition {high / low:.2g}; the energy does not fall any "
+                    "further"
                 )
         step, turn = length * way, then - slope
         bend = _dot(step, turn)
         if bend > 1e-12 * _norm(step) * _norm(turn):
             pairs.append((_single(step), _single(turn), bend))
+            curvature = bend / _norm(step) ** 2
+            low, high = min(low, curvature), np.fmax(high, curvature)
         q, energy, slope = ahead, got, then
         energies.append(energy)
         residuals.append(_norm(slope) / first)
     if residuals[-1] > tolerance:
         raise EquilibriumError(
-            f"residual: got {residuals[-1]:.2g} after {steps} steps, expected <= {tolerance}"
+            f"residual: got {residuals[-1]:.2g} after {steps} steps, expected <= {tolerance}; "
+            f"condition {high / low:.2g}; the steps are too few"
         )
     state = problem.state(q)
     least = float(find_least_area(state, problem.gradient, problem.texel_um))
@@ -368,7 +379,9 @@ def find_equilibrium(
             f"state: got an element of {least:.2g} times its affine area, expected > 0; the "
             "surface folds over; give a stretch nearer to 1"
         )
-    return state, Convergence(evaluations, residuals[-1], tuple(energies), tuple(residuals))
+    condition = float(high / low)
+    history = tuple(energies), tuple(residuals)
+    return state, Convergence(evaluations, residuals[-1], condition, *history)
 
 
 def _direction(slope: ComplexArray, pairs: Pairs) -> ComplexArray:

@@ -274,7 +274,8 @@ def stretch_skin(
     before = _excess_length(skin.height_um, skin.texel_um, np.eye(2), angle_deg)
     made = partial(StretchedSkin, skin, s, t, angle_deg, gradient)
     if s == 1.0 and t == 1.0:
-        still, none = np.zeros((*skin.height_um.shape, 2), np.float32), Convergence(0, 0.0, (), ())
+        still = np.zeros((*skin.height_um.shape, 2), np.float32)
+        none = Convergence(0, 0.0, math.nan, (), ())
         splines = _coefficients(skin.height_um), _coefficients(skin.albedo)
         return made(skin.height_um, skin.albedo, skin.alpha, still, before, before, none, *splines)
     count = skin.height_um.shape[0]

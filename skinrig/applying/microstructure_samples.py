@@ -269,7 +269,7 @@ def _draw_patch(
     figures = {
         "pixel_um": pixel_um,
         "tetrahedra": len(pushed.tetrahedra),
-        "iterations": pushed.iterations,
+        "iterations": pushed.outcome.iterations,
         "volume_ratio": pushed.volume_ratio,
         "stretch": [float(field.stretch.min()), float(field.stretch.max())],
         "r_d": list(SKIN_COLOR),

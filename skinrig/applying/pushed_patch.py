@@ -17,16 +17,18 @@ Axes: x to the right and y up on the skin, z out of it; mm; the block's surface 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, norm, onenormest, splu
 
 from model import microstructure
 from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_fields
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from skinrig.applying.microstructure import convolve_by_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
@@ -117,8 +119,8 @@ class PushedPatch:
     """(F, 3) node indices of the triangles at z = 0, counterclockwise from outside."""
     width_mm: float
     """Side of the surface, mm."""
-    iterations: int
-    """Total number of Newton iterations."""
+    outcome: SolverOutcome
+    """All Newton iterations; the last one's largest move, mm, and condition number (1-norm)."""
 
     @property
     def uv(self) -> Float64Array:
@@ -236,14 +238,15 @@ def solve_equilibrium(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) 
     reached, step, iterations = 0.0, 1.0 / steps, 0
     while reached < 1.0 - 1e-12:
         target = min(1.0, reached + step)
-        found, count = tissue.find_equilibrium(state, given * target)
-        iterations += count
+        found, end = tissue.find_equilibrium(state, given * target)
+        iterations += end.iterations
         if found is None:
             step *= 0.5
             if step < MIN_PUSH_STEP / steps:
                 raise PushDiverged(
-                    f"push: found no equilibrium beyond {100 * reached:.0f} % of it, expected "
-                    "convergence; use a smaller push, a finer mesh or a wider contact"
+                    f"push: found no equilibrium beyond {100 * reached:.0f} % of it in "
+                    f"{iterations} iterations (last move {end.residual:.2g} mm, {end.stop}), "
+                    "expected convergence; use a smaller push, a finer mesh or a wider contact"
                 )
         else:
             state, reached = found, target
@@ -253,7 +256,7 @@ def solve_equilibrium(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) 
         tetrahedra=tissue.corners,
         surface=_surface(tissue.mesh),
         width_mm=block.width_mm,
-        iterations=iterations,
+        outcome=replace(end, iterations=iterations),
     )
 
 
@@ -322,17 +325,17 @@ class _Tissue:
 
     def find_equilibrium(
         self, start: _State, displacement_mm: Float64Array
-    ) -> tuple[_State | None, int]:
-        """Return the equilibrium with given displacements, or None; and the iterations."""
+    ) -> tuple[_State | None, SolverOutcome]:
+        """Return the equilibrium with given displacements, or None; and how the search ended."""
         known = np.isfinite(displacement_mm)
         free = np.concatenate([~known.reshape(-1), np.ones(len(self.nodes), bool)])
         first = np.zeros(free.size)
         first[: -len(self.nodes)][known.reshape(-1)] = (displacement_mm - start.nodes_mm)[known]
-        state = start
+        state, move = start, math.inf
         for count in range(1, MAX_NEWTON_ITERATIONS + 1):
             system = self._system(state)
             if system is None:
-                return None, count
+                return None, SolverOutcome(count, move, UNKNOWN_CONDITION, "stalled")
             matrix, force, bubbles = system
             step = first if count == 1 else np.zeros(free.size)
             right = -force - matrix @ step
@@ -353,11 +356,16 @@ class _Tissue:
                 state.bubbles_mm - own - (by_bubble @ local[..., None])[..., 0],
                 state.pressure + step[3 * len(self.nodes) :],
             )
+            move = float(np.abs(moves).max())
             if not np.isfinite(step).all():
-                return None, count
-            if np.abs(moves).max() < self.tolerance_mm:
-                return state, count
-        return None, MAX_NEWTON_ITERATIONS
+                return None, SolverOutcome(count, move, UNKNOWN_CONDITION, "stalled")
+            if move < self.tolerance_mm:
+                inverse = LinearOperator(
+                    inner.shape, factors.solve, partial(factors.solve, trans="T"), dtype=np.float64
+                )
+                condition = float(norm(inner, 1) * onenormest(inverse, t=1))
+                return state, SolverOutcome(count, move, condition, "tolerance")
+        return None, SolverOutcome(MAX_NEWTON_ITERATIONS, move, UNKNOWN_CONDITION, "limit")
 
     def _system(
         self, state: _State

@@ -90,14 +90,14 @@ def adjust(
         cameras = dict(start)
     problem = BundleProblem(sightings, board, start, prior or LensPrior(), gauge)
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
-        cameras, places = problem.solve(cameras, places)
+        cameras, places, end = problem.solve(cameras, places)
     if gauge == "cameras":
         found = np.array([cameras[name].center_mm for name in problem.names])
         wanted = np.array([start[name].center_mm for name in problem.names])
         rigid = _procrustes(found, wanted)
         cameras = {name: _moved_camera(camera, *rigid) for name, camera in cameras.items()}
         places = {pose: move_pose(place, *rigid) for pose, place in places.items()}
-    return problem.solution_with_errors(cameras, places)
+    return problem.solution_with_errors(cameras, places, end)
 
 
 def estimate_board_pose(
@@ -137,7 +137,7 @@ def estimate_board_pose(
     images = {(name, pose): sighting for name, sighting in seen.items()}
     used = {name: cameras[name] for name in seen}
     problem = BundleProblem(images, board, used, LensPrior(), "cameras", cameras_fixed=True)
-    _, places = problem.solve(used, {pose: best[1]})
+    _, places, _ = problem.solve(used, {pose: best[1]})
     return places[pose]
 
 

@@ -24,24 +24,16 @@ from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
 _log = logging.getLogger(__name__)
 
 Gauge: TypeAlias = Literal["board", "cameras"]
-
-
+StopReason: TypeAlias = Literal["tolerance", "stalled"]
 Sightings: TypeAlias = Mapping[tuple[str, int], CornerObservation]
-
-
 Cameras: TypeAlias = Mapping[str, CameraPose]
 BoardPoses: TypeAlias = Mapping[int, BoardPose]
 Residuals: TypeAlias = Mapping[tuple[str, int], Float64Array]
 N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # parameters of a camera, of its lens, of a pose
 
-
 MAX_BUNDLE_STEPS = 100
-
-
 COST_TOL = 1e-10  # relative decrease of the cost
 STALL_TOL = 1e-6  # largest predicted decrease, relative, at which rounding may end the steps
-
-
 MIN_SIGMA_PX = 1e-9
 
 
@@ -82,6 +74,18 @@ class LensPrior:
         return np.array([self.focal * fx, self.focal * fy, shift, shift, *bending])
 
 
+@dataclass(frozen=True, slots=True)
+class BundleEnd:
+    """End of an adjustment: its steps, residual, condition and reason."""
+
+    steps: int
+    residual: float
+    """Relative decrease of the misfit: by the last step, or predicted if none lowers it."""
+    condition: float
+    """Of the last normal equations, scaled to a diagonal of one, without a free gauge."""
+    stop: StopReason
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
     """Result of a bundle adjustment.
@@ -105,6 +109,7 @@ class BundleResult:
     camera_covariance : ndarray of float64, shape (15 C, 15 C)
         Covariance of the parameters of all C cameras, in the order of their sorted names; see
         `step_camera`.
+    end : BundleEnd
     """
 
     cameras: dict[str, CameraPose]
@@ -115,6 +120,7 @@ class BundleResult:
     outliers: dict[tuple[str, int], int]
     center_covariance_mm2: dict[str, Float64Array]
     camera_covariance: Float64Array
+    end: BundleEnd
 
 
 class BundleProblem:
@@ -155,11 +161,11 @@ class BundleProblem:
 
     def solve(
         self, cameras: Cameras, poses: BoardPoses
-    ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
+    ) -> tuple[dict[str, CameraPose], dict[int, BoardPose], BundleEnd]:
         """Run Levenberg's method with Huber's weights; estimate the scale again at each step."""
         cameras, poses = dict(cameras), dict(poses)
         damping = 1e-3
-        for _ in range(MAX_BUNDLE_STEPS):
+        for steps in range(1, MAX_BUNDLE_STEPS + 1):
             residuals = self._residuals(cameras, poses)
             sigma = self._sigma(residuals)
             cost = self._cost(residuals, cameras, sigma)
@@ -175,28 +181,40 @@ class BundleProblem:
                     break
                 damping *= 10.0
             if new > cost:
-                left = float(g @ cho_solve(cho_factor(H + 1e-6 * np.diag(np.diag(H))), g))
-                left /= max(cost, 1e-300)
+                left = 0.0
+                if cost > 1.0:  # a sum of squares over noise; below, the misfit is rounding
+                    left = float(g @ cho_solve(cho_factor(H + 1e-6 * np.diag(np.diag(H))), g))
+                    left /= cost
                 if left > STALL_TOL:
                     _log.warning(
-                        "bundle adjustment: no step lowers the misfit, although its derivatives "
-                        "predict %.2g of it; compare the errors with the residuals",
+                        "bundle adjustment: after %d steps, no step lowers the misfit, although "
+                        "derivatives predict %.2g of it; compare the errors with the residuals",
+                        steps,
                         left,
                     )
                 break
             cameras, poses = trial
+            left = (cost - new) / max(cost, 1e-300)
             damping = max(damping / 10.0, 1e-12)
             if cost - new < COST_TOL * max(cost, 1e-300):
                 break
         else:
             raise BundleDiverged(
-                f"bundle adjustment: not converged after {MAX_BUNDLE_STEPS} steps; show more "
-                "poses of the board, tilted more"
+                f"bundle adjustment: not converged after {MAX_BUNDLE_STEPS} steps; the last lowers "
+                f"the misfit by {left:.2g} of it, expected below {COST_TOL}; condition "
+                f"{self._condition(H):.2g}; show more poses of the board, tilted more"
             )
-        return cameras, poses
+        stop: StopReason = "stalled" if left > STALL_TOL else "tolerance"
+        return cameras, poses, BundleEnd(steps, left, self._condition(H), stop)
+
+    def _condition(self, H: Float64Array) -> float:
+        size = np.sqrt(np.diag(H))
+        values = np.linalg.eigvalsh(H / np.outer(size, size))
+        freedoms = 0 if self.gauge == "board" or self.cameras_fixed else N_POSE
+        return float(values[-1] / max(values[freedoms], 1e-300))
 
     def solution_with_errors(
-        self, cameras: dict[str, CameraPose], poses: dict[int, BoardPose]
+        self, cameras: dict[str, CameraPose], poses: dict[int, BoardPose], end: BundleEnd
     ) -> BundleResult:
         """Return the solution with standard errors in the gauge."""
         residuals = self._residuals(cameras, poses)
@@ -236,7 +254,7 @@ class BundleProblem:
         }
         outliers = {key: n for key, n in far.items() if n}
         joint = covariance[: self.first, : self.first]
-        return BundleResult(found, poses, rms, noise, corners, outliers, centers, joint)
+        return BundleResult(found, poses, rms, noise, corners, outliers, centers, joint, end)
 
     def _inverse(self, H: Float64Array, cameras: Cameras) -> Float64Array:
         """Return the covariance; with a free frame, for a frame fixed by the camera centers."""

@@ -51,10 +51,20 @@ def _largest_shift(found: bundle.BundleResult, true: Mapping[str, CameraPose]) -
     return float(np.linalg.norm(gaps, axis=1).max())
 
 
+def _describe(found: bundle.BundleResult, text: str) -> str:
+    end = found.end
+    return (
+        f"{text}; {end.stop} after {end.steps} steps, residual {end.residual:.1e}, condition "
+        f"{end.condition:.1e}"
+    )
+
+
 def _exact_corners(real: InputPrecision) -> str:
     cameras = _cameras("C06", "C07", "C08")
     found = bundle.adjust(_corners(real, cameras, 0.0), CHARUCO_BOARD, cameras)
-    return expect_within(_largest_shift(found, cameras), 0.0, 0.05, label="shift, mm")
+    return _describe(
+        found, expect_within(_largest_shift(found, cameras), 0.0, 0.05, label="shift, mm")
+    )
 
 
 def _distant_start(real: InputPrecision) -> str:
@@ -69,7 +79,7 @@ def _distant_start(real: InputPrecision) -> str:
         for name, camera in cameras.items()
     }
     found = bundle.adjust(_corners(real, cameras, 0.05), CHARUCO_BOARD, start)
-    return expect_within(max(found.rms_px.values()), 0.0, 0.1, label="RMS, px")
+    return _describe(found, expect_within(max(found.rms_px.values()), 0.0, 0.1, label="RMS, px"))
 
 
 def _wrong_corners(real: InputPrecision) -> str:
@@ -79,7 +89,7 @@ def _wrong_corners(real: InputPrecision) -> str:
         observation.pixels[3] += 500.0
     found = bundle.adjust(seen, CHARUCO_BOARD, cameras)
     expect_within(_largest_shift(found, cameras), 0.0, 1.5, label="shift, mm")
-    return f"{sum(found.outliers.values())} of {len(seen)} wrong corners left out"
+    return _describe(found, f"{sum(found.outliers.values())} of {len(seen)} wrong corners left out")
 
 
 def _no_common_board(real: InputPrecision) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from capture.rig import load_rig
 from rigsim.skin_patch.equilibrium import EquilibriumError, LayerProblem, find_equilibrium
 from rigsim.skin_patch.microrelief import make_micro_skin
-from rigsim.skin_patch.stretch import layer_problem, mean_gradient
+from rigsim.skin_patch.stretch import StretchedSkin, layer_problem, mean_gradient, stretch_skin
 from rigsim.world.taped_skin import TapedSkin, TapedSkinError, TapeMechanics
 from skinrig.applying.pushed_patch import (
     Push,
@@ -49,7 +49,10 @@ def _solve(problem: LayerProblem) -> str:
         raise ExpectationError("state: got NaN, expected finite heights")
     if (np.diff(went.energies) > 1e-12 * abs(went.energies[0])).any():
         raise ExpectationError("energies: got a rise, expected none")
-    return f"residual {went.residual:.1e} after {went.evaluations} evaluations"
+    return (
+        f"residual {went.residual:.1e} after {went.evaluations} evaluations, condition "
+        f"{went.condition:.2g}"
+    )
 
 
 def _stiff_layer(real: InputPrecision) -> str:
@@ -94,12 +97,41 @@ def _too_few_steps(real: InputPrecision) -> str:
     )
 
 
+def _strained(real: InputPrecision, stretch: float) -> StretchedSkin:
+    skin = make_micro_skin("forehead", seed=0, size_mm=0.3)
+    return stretch_skin(skin, stretch=float(real(stretch)), angle_deg=0.0)
+
+
+def _excess_ratio(real: InputPrecision, stretch: float, low: float, high: float) -> str:
+    found = _strained(real, stretch)
+    ratio = found.excess_length / found.neutral_excess_length
+    return expect_within(ratio, low, high, label="excess length over that at rest")
+
+
+def _halved_relief(real: InputPrecision) -> str:
+    return _excess_ratio(real, 0.5, 1.0, np.inf)
+
+
+def _shortened_relief(real: InputPrecision) -> str:
+    return _excess_ratio(real, 0.73, 1.0, np.inf)
+
+
+def _doubled_relief(real: InputPrecision) -> str:
+    return _excess_ratio(real, 2.0, 0.0, 1.0)
+
+
+def _hardly_stretched_relief(real: InputPrecision) -> str:
+    found = _strained(real, 1.0 + 1e-5)
+    return "heights, um " + expect_near(found.height_um, found.skin.height_um, absolute=0.01)
+
+
 def _pushed(block: SkinBlock, probe: Push, check: Callable[[PushedPatch], str]) -> str:
     try:
         found = push_block(block, probe)
     except MissingExtra:
         return "not run: scikit-fem is not installed"
-    return f"{check(found)}, {found.iterations} iterations"
+    end = found.outcome
+    return f"{check(found)}, {end.iterations} iterations, condition {end.condition:.1g}"
 
 
 def _incompressible_push(real: InputPrecision) -> str:

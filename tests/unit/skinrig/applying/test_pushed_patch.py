@@ -44,6 +44,8 @@ def test_pulled_block_stretch_matches_closed_form(stretch, poisson):
     np.testing.assert_allclose(strain.r_s[surface], pair[1], rtol=1e-6)
     np.testing.assert_allclose(strain.r_t[surface], pair[0], rtol=1e-6)
     assert patch.volume_ratio == pytest.approx(stretch * across**2, rel=1e-6)
+    assert patch.outcome.converged
+    assert patch.outcome.condition > 1.0
 
 
 def test_affine_border_motion_moves_interior_alike(rng):
@@ -211,7 +213,7 @@ def test_push_beyond_equilibrium_is_reported():
     nodes = nodes_of(one)
     given = np.where(held_of(nodes, one.depth_mm)[:, None], 0.0, np.full(nodes.shape, np.nan))
     given[np.abs(nodes).sum(axis=1) < 1e-9] = (0.0, 0.0, -9.0)
-    with pytest.raises(PushDiverged, match="no equilibrium beyond"):
+    with pytest.raises(PushDiverged, match=r"no equilibrium beyond .* in \d+ iterations"):
         pushed_patch.solve_equilibrium(one, given)
 
 

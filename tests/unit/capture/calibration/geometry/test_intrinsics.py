@@ -214,12 +214,15 @@ def test_bundle_warns_only_where_steps_fail(rng, monkeypatch, caplog, noise_px):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07"]))
     true = {name: bent(camera, 0.3 * LENS) for name, camera in nominal.items()}
     seen = sightings_of(true, boards_in_view(rng, 6), rng, noise_px)
-    bundle.adjust(seen, BOARD, nominal)
+    end = bundle.adjust(seen, BOARD, nominal).end
     assert caplog.records == []
+    assert end.stop == "tolerance"
+    assert end.residual < 1e-6
+    assert 1.0 < end.condition < 1e9
     problem, cost = bundle_equations.BundleProblem, bundle_equations.BundleProblem._cost
     tried = iter(range(1, 10_000))  # each trial costs more than the one before
     monkeypatch.setattr(problem, "_cost", lambda self, *at: cost(self, *at) + next(tried))
-    bundle.adjust(seen, BOARD, nominal)
+    assert bundle.adjust(seen, BOARD, nominal).end.stop == "stalled"
     assert any("no step lowers the misfit" in r.getMessage() for r in caplog.records)
 
 
