@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
-from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason
 from model.traits.reduced_spaces import mixture_coordinates
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import fit as brdf_basis
@@ -259,7 +259,8 @@ def refine_mixtures(
             break
         last, change = left, (last - left) / max(abs(left), 1e-300)
     else:
-        outcome = SolverOutcome(sweeps, change, UNKNOWN_CONDITION, "limit")
+        stop: StopReason = "limit" if change >= SWEEP_TOL else "tolerance"
+        outcome = SolverOutcome(sweeps, change, UNKNOWN_CONDITION, stop)
         outcome.warn_unless_converged("refinement of common mixtures", _log)
     size = rows.sum(axis=1, keepdims=True)
     even = np.full(basis.size, 1.0 / basis.size)

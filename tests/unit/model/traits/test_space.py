@@ -331,6 +331,14 @@ def test_non_negative_nearest_mixtures_are_those_of_scipy(rng):
     assert found.min() >= 0.0
 
 
+def test_unfinished_active_sets_are_counted(monkeypatch, caplog):
+    nonnegative_kernels.nearest_mixtures(np.eye(2), [[1.0, -1.0]])
+    assert caplog.records == []
+    monkeypatch.setattr(nonnegative_kernels, "_solve_rows", lambda gram, rows: 1)
+    nonnegative_kernels.nearest_mixtures(np.eye(2), [[1.0, -1.0], [-1.0, 1.0]])
+    assert ["1 of 2 reached" in r.getMessage() for r in caplog.records] == [True]
+
+
 def test_nonnegative_mixtures_are_their_own_nearest(rng):
     wanted = rng.random((5, 6))
     np.testing.assert_array_equal(

@@ -60,6 +60,20 @@ def test_weights_are_never_negative_and_few(face, basis):
         assert np.mean((weights > 0.0).sum(axis=1)) < 20
 
 
+def test_full_set_of_materials_is_reported(face, basis, rng, caplog):
+    brdf_basis.fit_weights(samples_of(face), basis)
+    assert caplog.records == []
+    light, view = rng.normal(size=(2, 4, 200, 3))
+    for way in (light, view):
+        way[..., 2] = np.abs(way[..., 2]) + 0.2
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    up = np.broadcast_to([0.0, 0.0, 1.0], (4, 3))
+    every = np.einsum("pmk,pk->pm", basis.evaluate(light, view, up[:, None]), rng.random((4, 59)))
+    s = brdf_basis.surface_samples(every[..., None], light, view, up, np.zeros((4, 1)), eta=1.0)
+    brdf_basis.fit_weights(s, basis)
+    assert ["of 4 points" in r.getMessage() for r in caplog.records] == [True]
+
+
 def test_a_mixture_comes_back_through_the_whole_convention(face, basis):
     rng = np.random.default_rng(9)
     truth = np.zeros((len(face.f), 59))

@@ -79,6 +79,13 @@ def test_a_refinement_only_lowers_the_error(many, basis, rng):
     assert errors[-1] < 0.8 * errors[0]
 
 
+@pytest.mark.parametrize(("sweeps", "warnings"), [(1, 1), (60, 0)])
+def test_refinement_warns_at_its_limit(three, basis, caplog, sweeps, warnings):
+    start = np.zeros((2, 59))
+    brdf_space.refine_mixtures(three[:1], start, basis, sweeps=sweeps)
+    assert ["common mixtures" in r.getMessage() for r in caplog.records] == [True] * warnings
+
+
 def test_normalized_curves_begin_at_unity(three, basis):
     found = brdf_space.compute_error_curve(three, basis, ranks=(1, 2, 3))
     np.testing.assert_allclose(found.normalized(), found.error / found.error[0])
