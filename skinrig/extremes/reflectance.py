@@ -99,6 +99,12 @@ def _duplicated_rows(real: InputPrecision) -> str:
     return expect_within(error, 0.0, 1e-3, label="error")
 
 
+def _units_of_rows(real: InputPrecision) -> str:
+    weights = np.random.default_rng(1).random((30, 12))
+    errors = [brdf_basis.reduce(real(scale * weights), 3)[2] for scale in (1e-6, 1.0, 1e6)]
+    return "errors " + expect_near(errors, np.full(3, errors[1]), relative=0.02)
+
+
 def _merl_bins(real: InputPrecision) -> str:
     half = real(0.5) * real(np.pi)
     first, last = (

@@ -224,6 +224,29 @@ def _no_diffuse(real: InputPrecision) -> str:
     return expect_within(found.r_d[found.valid], -1e-6, 1e-6, label="R_d")
 
 
+def _estimate_even(real: InputPrecision, samples: Float64Array) -> diffuse_albedo.DiffuseAlbedo:
+    """Return the albedo from samples of one gray point without an index step."""
+    lights = ring_directions(samples.shape[0], 0.5)
+    views = np.broadcast_to(UP_NORMAL, lights.shape)
+    given = real(samples[None, :, None])
+    return diffuse_albedo.estimate(given, lights[None], views[None], UP_NORMAL[None], eta=1.0)
+
+
+def _white_surface(real: InputPrecision) -> str:
+    return expect_near(_estimate_even(real, np.full(20, 1.0 / np.pi)).r_d, 1.0, absolute=1e-6)
+
+
+def _nearly_black_surface(real: InputPrecision) -> str:
+    samples = 1e-3 * (1.0 + 0.01 * np.random.default_rng(0).standard_normal(20)) / np.pi
+    return expect_near(_estimate_even(real, samples).r_d, 1e-3, relative=0.01)
+
+
+def _no_numbers_in_samples(real: InputPrecision) -> str:
+    samples = np.full(20, 0.5 / np.pi)
+    samples[::2], samples[1] = np.nan, np.inf
+    return expect_near(_estimate_even(real, samples).r_d, 0.5, absolute=1e-6)
+
+
 def _nothing_to_fill(real: InputPrecision) -> str:
     empty = texture_fill.push_pull(real(np.zeros((9, 7, 3))), np.zeros((9, 7)))
     one = np.zeros((9, 7))

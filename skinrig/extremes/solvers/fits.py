@@ -136,6 +136,13 @@ def _ill_conditioned_mixtures(real: InputPrecision) -> str:
     return "misfit " + expect_within(np.linalg.norm(off), 0.0, 5e-3)
 
 
+def _units_of_materials(real: InputPrecision) -> str:
+    gram, wanted = np.array([[1.0, 0.8], [0.8, 1.0]]), np.array([[1.0, -0.5]])
+    scales = (1e-18, 1e18)
+    found = [nearest_mixtures(np.asarray(real(s * gram), np.float64), wanted)[0] for s in scales]
+    return "weights " + expect_near(found, [[0.6, 0.0]] * 2, absolute=1e-6)
+
+
 def _equal_faces(real: InputPrecision) -> str:
     same = real(np.tile([0.5, 0.5], (4, 1)))
     labels = {"oil": np.array([True, False, True, False])}
