@@ -50,11 +50,11 @@ is at most a few thousand times the noise, of which a tenth counts."""
 MAX_REMAINING_NOISE_RATIO = 0.05
 """Limit of the remaining bounces, relative to the noise."""
 
-BOUNCE_MARGIN = 1.3
+BOUNCE_MARGIN = 1.4
 SPECTRAL_MARGIN = 1.65
 STEP_MARGIN = 1.5
 """Factors on the first bounce, its color and its wavelengths, for parts of patches; set on 4 scenes
-of the flash rig and under grazing light."""
+of the flash rig, under grazing light, and on the darkest face in the dome."""
 
 LATERAL_MARGIN = 0.6
 LENS_MARGIN = 0.6

@@ -20,9 +20,9 @@ RELIEF_PIXELS: Final = 400
 MAX_PIXEL_TEXELS: Final = 6
 """Texels along each side of such a pixel."""
 
-RELIEF_MARGIN: Final = 2.7
+RELIEF_MARGIN: Final = 3.3
 """Factor on the size, for pixels between the evaluated texels and for highlights; set on 16 scenes
-of the flash rig."""
+of the flash rig and on an expression in the dome."""
 
 
 def relief_shadows_over_noise(
