@@ -182,7 +182,7 @@ def import_photos(
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for number, (step, entry) in enumerate(steps):
-            progress(f"store photograph {number}/{len(steps)}: {entry.file.name}")
+            progress(f"store photograph {number}/{len(steps)}")
             _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
@@ -234,7 +234,7 @@ def _inspect(
     entries, faults = [], []
     placed: dict[tuple[str, tuple[int, ...]], tuple[Framing, tuple[float, ...]]] = {}
     for number, file in enumerate(files):
-        progress(f"read photograph {number}/{len(files)}: {file.name}")
+        progress(f"read photograph {number}/{len(files)}")
         try:
             photo = read_photo(file, turn_raw=turn_raw)
             if photo.white_value == 0.0:

@@ -99,7 +99,7 @@ def test_counted_progress_precedes_each_part(photos, tmp_path, capsys):
     place = str(store.write(tmp_path / "maps", SkinAppearance(maps, "simulated")))
     out = str(tmp_path / "out")
     for argv, text in (
-        (["import", "photos", str(photos), "--out", out + "s"], "read photograph 1/2: b.png"),
+        (["import", "photos", str(photos), "--out", out + "s"], "read photograph 1/2"),
         (["report", place, "--out", out + ".html"], "draw section 0/1: maps"),
         (["view", place, "--out", out + "v.html"], "content 1/2: color and uncertainty"),
         (["export", place, "--to", "maps", "--out", out], "content 1/2: r_d"),

@@ -70,8 +70,8 @@ def list_demo_folders():
     made |= {
         f"truth-flash-{demo_rigs.DEMO_SUBJECT}-{state}" for state in demo_rigs.FLASH_STATES[1:]
     }
-    for rig, function in demo_rigs.RIGS.items():
-        nodes = list(ast.walk(ast.parse(inspect.getsource(function))))
+    for rig in demo_rigs.RIGS:
+        nodes = list(ast.walk(ast.parse(inspect.getsource(demo_rigs.RUN_BY_PART[rig]))))
         loops = {ast.unparse(one.target): one.iter for one in nodes if isinstance(one, ast.For)}
         # results of targets serve calibrations alone
         targets = [one.value for one in nodes if isinstance(one, ast.Expr)]
