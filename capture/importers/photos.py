@@ -140,7 +140,7 @@ def import_photos(
     source : ImageSource, optional
         Origin of the photographs; its assumptions are stored before the import's own.
     progress : callable
-        Called with the number and the count before each photograph is read, and is stored.
+        Called with a line of text before each photograph is read, and before each is stored.
     now : callable, optional
         Clock, returns a time with its zone.
 

@@ -259,7 +259,7 @@ def refine_mixtures(
             break
         last, change = left, (last - left) / max(abs(left), 1e-300)
     else:
-        stop: StopReason = "limit" if change >= SWEEP_TOL else "tolerance"
+        stop: StopReason = "tolerance" if change < SWEEP_TOL else "limit"
         outcome = SolverOutcome(sweeps, change, UNKNOWN_CONDITION, stop)
         outcome.warn_unless_converged("refinement of common mixtures", _log)
     size = rows.sum(axis=1, keepdims=True)

@@ -38,8 +38,8 @@ from being pulled to the face's mean."""
 MAX_CONTAMINATION: Final = 0.5
 MIN_SIGMAS: Final = (0.02, 0.02)
 """Minimum standard deviations of log melanin, the limit of what colors resolve, and of blood's cube
-root. Simulated faces have 0.008 to 0.016 without lips, which `MIN_CONTAMINATION` is for, and 0.03
-to 0.05 with them. That is below the error of a pixel, so colors determine it badly."""
+root. Simulated faces have 0.008 to 0.016 without lips, which count as outliers, and 0.03 to 0.05
+with them. That is below the error of a pixel, so colors determine it badly."""
 MAX_SIGMAS: Final = (2.0, 0.5)
 _START_SIGMAS: Final = (0.3, 0.1)
 _SEARCH_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])

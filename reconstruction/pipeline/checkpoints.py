@@ -54,7 +54,7 @@ class BusyError(ValueError):
 
 
 @cache
-def code_digest(packages: Sequence[str] = PRODUCT_PACKAGES) -> str:
+def code_digest(packages: tuple[str, ...] = PRODUCT_PACKAGES) -> str:
     """Hash the code and data of packages, by default those of maps, and the libraries' versions."""
     digest = hashlib.sha256()
     for name, version in list_library_versions().items():

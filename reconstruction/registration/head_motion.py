@@ -205,7 +205,9 @@ def estimate(
     the noise of the reference frame, are not included.
     """
     points, outward, times = _checked(frames, cameras, points_mm, normals, times_s, reference)
-    lights = np.broadcast_to(np.asarray(light, np.float64), times.shape)
+    lights = np.asarray(light, np.float64)
+    lights = np.full(times.shape, lights) if lights.ndim == 0 else lights
+    Checks(HeadMotionError).shape("light", lights, times.shape)
     Checks(HeadMotionError).within("light", lights, "(0, inf)")
     chosen, evened = [], []
     for number, camera in enumerate(cameras):

@@ -18,8 +18,8 @@ MAX_NONRIGID_FRAME_FRACTION = 1 / 3
 """Fraction of frames above which a track that is nonrigid is not on the skin."""
 FACE_PART_MM = 15.0
 MAX_PART_RESIDUAL_RATIO = 2.5
-"""Residual of the worst part of a face over the capture's median one, and over the median relative
-to the frame's own residuals: an expression exceeds both."""
+"""Residual of the worst part of a face over the median one of frames of like light, and over the
+median relative to the frame's own residuals: an expression exceeds both."""
 _MIN_RESIDUAL_PX = 1e-6
 RAYLEIGH_MEDIAN = 1.1774100225154747
 """Median length of a unit normal vector in two dimensions."""
@@ -60,7 +60,7 @@ def find_rigid_frames(
     known, scales = np.isfinite(residual_px), residual_scales(residual_px)
     others = determined & (np.arange(frames) != reference)
     peers = _peers(light, others)
-    usual_scale = np.array([_middle(scales[each]) for each in peers])[:, None]
+    usual_scale = _middles(scales, peers)[:, None]
     far = residual_px > np.maximum(TRACK_OUTLIER_SIGMAS * usual_scale, TRACK_OUTLIER_PX)
     # a track that is nonrigid in many frames is at an occluding edge, not in an expression
     steady = np.ones(len(points_mm), bool)
@@ -69,12 +69,12 @@ def find_rigid_frames(
     share = np.mean(far[:, steady], axis=1) if steady.any() else np.ones(frames)
     used = zip(residual_px, known & steady, strict=True)
     worst = np.array([_worst_part(points_mm[use], row[use]) for row, use in used])
-    usual_share = np.array([_middle(share[each]) for each in peers])
+    usual_share = _middles(share, peers)
     most = np.minimum(usual_share + MAX_EXCESS_NONRIGID_FRACTION, MAX_NONRIGID_FRACTION)
     rigid = determined & (share <= most)
     # residuals grow as the head turns under the lights, also those of the worst part
     own = worst / np.maximum(scales, _MIN_RESIDUAL_PX)
-    usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
+    usual = np.minimum(_middles(worst, peers), _middles(own, peers) * scales)
     rigid &= worst <= np.fmax(MAX_PART_RESIDUAL_RATIO * usual, TRACK_OUTLIER_PX)
     rigid[reference] = True
     return np.asarray(rigid)
@@ -99,6 +99,10 @@ def _worst_part(points: Float64Array, length: Float64Array) -> float:
         for number in np.flatnonzero(count >= 3):
             worst = max(worst, float(np.median(length[part == number])))
     return worst
+
+
+def _middles(values: Float64Array, peers: list[BoolArray]) -> Float64Array:
+    return np.array([_middle(values[each]) for each in peers])
 
 
 def _middle(values: Float64Array) -> float:

@@ -157,8 +157,10 @@ class _Run:
         self.console.print_line(f"{path}: continued, has {', '.join(earlier['stages']) or 'none'}")
 
     def list_finished(self) -> set[str]:
-        """Return the stages that an earlier run measured to their end."""
-        return self.earlier["stages"].keys() - {name for name, _ in self.earlier["left_out"]}
+        """Return the stages that an earlier run of the same selection measured to their end."""
+        stages = self.earlier["stages"].items()
+        same = {name for name, stage in stages if stage["selection"] == self.selection}
+        return same - {name for name, _ in self.earlier["left_out"]}
 
     def measure(self, name: str, size: Size) -> float:
         """Measure a stage if the budget allows, and return the elapsed seconds."""
@@ -224,6 +226,7 @@ class _Run:
         for name, made in self.done.items():
             stage = document["stages"][made.name]
             stage["size"] = self.size[name]
+            stage["selection"] = self.selection
             stage["compile_seconds"] = self.compile_s[name]
             if self.size[name] == "small":
                 stage["limits"] = []

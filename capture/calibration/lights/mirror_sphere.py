@@ -380,7 +380,7 @@ def _fit(
     else:
         _log.warning(
             "mirror sphere: not converged after %d steps; last step %.2g mm, condition %.2g; "
-            "compare the edges' noise",
+            "check the outline in the images, and capture the sphere again",
             MAX_SPHERE_STEPS,
             np.linalg.norm(change),
             np.linalg.cond(H),

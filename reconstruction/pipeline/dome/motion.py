@@ -156,5 +156,5 @@ def _gray(session: Session, record: Any) -> Float32Array:
 
 def _light(record: Any) -> float:
     """Return the level of the LEDs times the exposure time."""
-    level, exposure_s = (float(record.settings.get(key) or 1.0) for key in ("level", "exposure_s"))
+    level, exposure_s = (float(record.settings.get(key, 1.0)) for key in ("level", "exposure_s"))
     return max(level * exposure_s, 1e-9)

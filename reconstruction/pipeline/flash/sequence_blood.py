@@ -56,8 +56,8 @@ class SkinColorModel:
     def of_face(self, image: SkinMap) -> tuple[SkinColorModel, FloatArray, float]:
         """Return the model with exact optics, and what a face's optics add to it.
 
-        These are the factor of the face's colors that leads to the model, and the standard error of
-        the log of its blood.
+        These are the factor of the face's colors that leads to the model, and the 68 % half-width
+        of its blood, relative.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class SiteBlood:
     moved: BoolArray
     """(N,): frames in which the face has moved."""
     common_log_sd: float
-    """Standard error of the log of all blood, by optics of the face."""
+    """Relative 68 % half-width of all blood, by optics of the face."""
 
 
 def average_disc_blood(
