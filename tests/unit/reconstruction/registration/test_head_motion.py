@@ -5,6 +5,7 @@ import pytest
 
 from reconstruction.registration import head_motion
 from reconstruction.registration.head_motion import HeadMotionError, rotation_matrix
+from reconstruction.registration.rigid_frames import find_rigid_frames
 
 RADIUS_MM = 80.0
 WIDTH, HEIGHT, FOCAL_PX = 160, 150, 500.0
@@ -235,3 +236,18 @@ def test_frames_without_motion_cues_are_refused_by_name(rng):
         head_motion.estimate(frames, CAMERAS, points, normals[:5], [0.0, 1.0])
     with pytest.raises(HeadMotionError, match="reference"):
         head_motion.estimate(frames, CAMERAS, points, normals, [0.0, 1.0], reference=2)
+
+
+@pytest.mark.parametrize("noise_px", [0.3, 0.5])
+def test_worst_part_is_compared_among_frames_of_like_light(noise_px, rng):
+    points = rng.uniform(-60.0, 60.0, (600, 3)) * [1.0, 1.0, 0.1]
+    dark = np.arange(12) >= 7
+    scale = np.where(dark, noise_px, 0.02)
+    residual = np.linalg.norm(scale[:, None, None] * rng.standard_normal((12, 600, 2)), axis=-1)
+    residual[0] = 0.0
+    residual[[3, 9], :60] += 6.0 * noise_px + 2.0  # expressions in a bright and a dark frame
+    known, light = np.ones(12, bool), np.where(dark, 1.0, 4.0)
+    found = find_rigid_frames(residual, points, known, light, 0)
+    assert np.flatnonzero(~found).tolist() == [3, 9]
+    one_light = find_rigid_frames(residual, points, known, np.ones(12), 0)
+    assert np.flatnonzero(~one_light).tolist() != [3, 9]

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from model import fresnel
 from model.brdf import tables as brdf_tables
-from reconstruction import diffuse_albedo
+from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.lumitexels.samples import Lumitexels
 from reconstruction.surface import estimates
 from reconstruction.surface.model_normals import PointLobes
@@ -404,6 +404,20 @@ def test_lobe_errors_fall_with_views_only(new_views, factor):
     )
     relative = [found.stderr.max(axis=1) / found.values.max(axis=1) for found in (once, twice)]
     np.testing.assert_allclose(relative[1], factor * relative[0], rtol=0.02)
+
+
+def test_lobe_errors_are_at_least_those_of_independent_samples():
+    truth, basis = cap(20), brdf_tables.default_basis()
+    samples = make(truth, lobe=lambda angle: 0.3 * np.exp(-((angle / 0.3) ** 2)))
+    alone = dataclasses.replace(samples, view=np.arange(len(samples.view)))
+    few = basis.mix_materials(np.eye(len(basis.names))[:2])
+    stated = estimates.fit_lobe_weights(alone, known(truth), albedo_of(truth), few)
+    shine = estimates.specular_samples(alone, known(truth), albedo_of(truth))
+    own = brdf_basis.fit_weights(shine, few).stderr
+    relative = stated.stderr.max(axis=1) / stated.values.max(axis=1)
+    good = stated.valid & np.isfinite(own) & (own < 0.5)
+    assert good.all()
+    np.testing.assert_allclose(relative[good], own[good], rtol=1e-5)
 
 
 def by_one_light(samples):
