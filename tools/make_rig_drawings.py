@@ -43,8 +43,8 @@ class Drawing:
     def dots(
         self, places: Iterable[tuple[float, float]], r: float, fill: str, **style: object
     ) -> None:
-        """Draw many dots as one path of round caps: reports embed the file."""
-        path = "".join(f"M{_number(x)} {_number(y)}h0" for x, y in places)
+        """Draw dots as one path of round caps, coincident ones once: reports embed the file."""
+        path = "".join(dict.fromkeys(f"M{_number(x)} {_number(y)}h0" for x, y in places))
         self.add("path", d=path, stroke=fill, stroke_width=2 * r, stroke_linecap="round", **style)
 
     def box(
@@ -62,7 +62,7 @@ class Drawing:
         self.label(at, text, font_weight="bold")
 
     def save(self, name: str) -> None:
-        text = "\n".join([*self.parts, "</svg>", ""])
+        text = "\n".join([*dict.fromkeys(self.parts), "</svg>", ""])
         for folder in FOLDERS:
             (folder / f"rig-{name}.svg").write_text(text, encoding="utf-8")
 

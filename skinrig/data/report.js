@@ -91,7 +91,7 @@
     const difference = make("canvas", { class: "difference", role: "img" });
     const bar = make("div");
     const point = make("div", { class: "point" });
-    const stage = make("div", { class: "stage", tabindex: 0, role: "group", "aria-label": "Image: arrow keys read its values" });
+    const stage = make("div", { class: "stage", tabindex: 0, role: "application", "aria-roledescription": "image probe", "aria-label": "Image: arrow keys read its values" });
     const close = make("button", { type: "button" }, "Close");
     const dialog = make("dialog", { class: "enlarged", "aria-label": names[first] });
     const controls = make("div", { class: "controls" }, left);

@@ -1,7 +1,7 @@
 """Draw the head of a set of maps: its title, weakest result, rig and a captured image."""
 
-import base64
 import html
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -16,6 +16,8 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.arrays import FloatArray
+from skinrig.console import format_count
+from skinrig.drawing import png
 from skinrig.reporting import map_images, page, verdict
 from skinrig.reporting.map_names import map_title
 from skinrig.reporting.sections import dynamic, microrelief, sequence, subsurface
@@ -28,6 +30,8 @@ RIG_TITLES: Final = {
     "probe": "Fiber probe",
 }
 _VIEW_BOX: Final = re.compile(r'viewBox="0 0 (\d+) (\d+)"')
+OMITTED_FRAMES: Final = frozenset({"dark", "tracking"})
+"""Kinds and patterns of frames that are not shown as the captured image."""
 _UNUSED_NOISE: Final = {"gain": 1.0, "read_noise": 1.0}
 """Only the values of an image are drawn; their variance is not."""
 
@@ -49,7 +53,7 @@ def draw_head(subject: page.ReportedAppearance, session: Session | None) -> Iter
     yield page.Heading(title, 2, subject.name)
     if sentence := describe_weakest(subject.name, subject.checks, appearance):
         yield page.Paragraph(sentence)
-    images = [_draw_rig(rig)] if rig in RIG_TITLES else []
+    images = [_draw_rig(session)] if session is not None and rig in RIG_TITLES else []
     if not is_fused(appearance):
         images += _draw_captured(appearance, session)
     if images:
@@ -59,7 +63,9 @@ def draw_head(subject: page.ReportedAppearance, session: Session | None) -> Iter
 def _name_contents(appearance: SkinAppearance) -> str:
     if dynamic.is_dynamic(appearance):
         has_color = "facial_color" in describe_parts(appearance)
-        return f"moving face: {'skin color by expression' if has_color else 'surface by strain'}"
+        return (
+            f"moving {'face: skin color by expression' if has_color else 'skin: surface by strain'}"
+        )
     if is_fused(appearance):
         return "fused person: maps of all rigs"
     if "position" in appearance.maps:
@@ -96,7 +102,8 @@ def describe_weakest(name: str, checks: Sequence[page.Check], appearance: SkinAp
     """
     if not checks:
         uncertain = verdict.list_least_certain(name, appearance)
-        return f"Least certain: {uncertain[0].removeprefix(f'{name}: ')}." if uncertain else ""
+        least = uncertain[0].removeprefix(f"{name}: ") if uncertain else ""
+        return f"Least certain: {least}.".replace(" %", "\N{NO-BREAK SPACE}%") if least else ""
     weakest = max(checks, key=lambda one: (not one.passed, one.used if one.used > 0.0 else 0.0))
     got, bound = (
         format_quantity(page.format_number(one), weakest.unit)
@@ -108,17 +115,20 @@ def describe_weakest(name: str, checks: Sequence[page.Check], appearance: SkinAp
     return f"{label}: {what}, {got} (limit {bound}){where}.".replace(" %", "\N{NO-BREAK SPACE}%")
 
 
-def _draw_rig(rig: str) -> page.Image:
-    """Return the drawing of a packaged rig."""
+def _draw_rig(session: Session) -> page.Image:
+    """Return the drawing of the packaged rig of a session."""
+    rig = session.rig.name
     text = resources.files("skinrig").joinpath(f"data/rig-{rig}.svg").read_text(encoding="utf-8")
     (width, height), title = _VIEW_BOX.findall(text)[0], re.findall("<title>(.*?)</title>", text)[0]
-    address = f"data:image/svg+xml;base64,{base64.b64encode(text.encode()).decode()}"
-    caption = f"{RIG_TITLES[rig]}, standard layout"
+    address = png.to_data_url(text.encode(), "svg+xml")
+    lights = format_count(len(session.rig.lights), "light")
+    cameras = format_count(len(session.rig.views), "camera")
+    caption = f"{RIG_TITLES[rig]}: full layout; this session used {lights} and {cameras}"
     return page.Image(caption, address, html.unescape(title), (int(width), int(height)))
 
 
 def _draw_captured(appearance: SkinAppearance, session: Session | None) -> list[page.Image]:
-    """Return the images among the maps; without them, a frame of the session."""
+    """Return the images among the maps; without them, a frame of the most frontal camera."""
     drawn: list[page.Image] = []
     white = 0.0
     for key in ("image", "specular_image"):
@@ -128,11 +138,25 @@ def _draw_captured(appearance: SkinAppearance, session: Session | None) -> list[
             shown = map_images.expose(one.values, one.mask, white)
             title = f"{map_title(key)}, linear RGB, white: {white:.2g}"
             drawn.append(map_images.draw_color_image(title, shown))
-    lit = [] if session is None else [one for one in session.frames() if one.kind != "dark"]
-    if session is not None and lit and not drawn:
+    if session is not None and not drawn:
         with suppress(SessionError, raw.RawError, OSError):
-            drawn.append(_draw_frame(session, lit[len(lit) // 2]))
+            drawn += [_draw_frame(session, one) for one in _choose_frame(session)]
     return drawn
+
+
+def _choose_frame(session: Session) -> list[FrameRecord]:
+    """Return a lit frame of the most frontal camera, in the middle of a session; may be empty."""
+    lit = [
+        one
+        for one in session.frames()
+        if OMITTED_FRAMES.isdisjoint((one.kind, one.index.get("pattern")))
+    ]
+    cosines = {
+        view.name: view.position_mm[2] / math.hypot(*view.position_mm) for view in session.rig.views
+    }
+    camera = max((one.camera for one in lit), key=cosines.__getitem__, default="")
+    lit = [one for one in lit if one.camera == camera]
+    return lit[len(lit) // 2 :][:1]
 
 
 def _draw_frame(session: Session, record: FrameRecord) -> page.Image:
@@ -145,5 +169,8 @@ def _draw_frame(session: Session, record: FrameRecord) -> page.Image:
         balance: FloatArray = np.array(frame.neutral or (1.0, 1.0, 1.0), np.float32)
         linear = raw.linear_rgb(frame, demosaic="centered", **_UNUSED_NOISE).rgb / balance
     white = map_images.find_white(linear, np.ones(linear.shape[:2], bool))
-    title = f"captured frame {record.step_id}, camera {record.camera}, white: {white:.2g}"
+    title = (
+        f"captured frame, camera {record.camera}, step {record.step_id}; "
+        f"white is {white:.2g} of full scale"
+    )
     return map_images.draw_color_image(title, linear / white, lossy=True)

@@ -89,7 +89,7 @@ class MapDrawing:
         every = np.ones(normals.shape[:2], bool)
         mask = shrink(every if self.valid is None else self.valid, self.width).astype(bool)
         codes = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0))
-        image = codes.astype(np.uint8) & np.uint8(0xFE)  # 128 steps, as in a color scale
+        image = _coarsen(codes.astype(np.uint8))
         image[~mask] = png.INVALID_GRAY
         alt = f"{self.of or 'normals'}, {title}: x, y, z as red, green, blue"
         if mask.any():
@@ -142,12 +142,19 @@ def draw_color_image(
             f": median linear red, green, blue {', '.join(format_number(float(v)) for v in middle)}"
         )
     alt = (f"{of}, {title}" if of else title) + level
-    return _build_image(title, _address(png.encode_srgb8(small), lossy), alt, small.shape[:2])
+    image = png.encode_srgb8(small)
+    address = _address(image if lossy else _coarsen(image), lossy)
+    return _build_image(title, address, alt, small.shape[:2])
 
 
 def draw_plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
     return _build_image(title, _address(image), alt or title, image.shape[:2])
+
+
+def _coarsen(codes: UInt8Array) -> UInt8Array:
+    """Return colors in 128 steps, as in a color scale; gray and white stay."""
+    return np.where(codes < 255, codes & np.uint8(0xFE), codes)
 
 
 def _address(image: UInt8Array, lossy: bool = False) -> str:

@@ -243,6 +243,8 @@ def _maps(
         contents = name, again, captured and captured.content_hash, *digests
         draw = partial(_draw_chapter, draw, subject, captured)
         yield from drawn.draw(contents, draw, checks)
+    if progress is not None and appearances:
+        progress(f"draw section {len(appearances)}/{len(appearances)}: the rest")
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
 

@@ -124,17 +124,20 @@ def list_weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, s
             ("limit missed", f"{len(missed) - MAX_NAMED_MISSED} more, see below", "", "", "")
         )
     named: set[str] = set()
+    listed: list[str] = []
     for check in checks:
         beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
         if beyond and check.worst not in named:  # channels of a map share their group
             named.add(check.worst)
-            out.append(("one group above the limit", *_compared(check)))
+            listed.append(check.name)
+            out.append(("kept; one group above the limit", *_compared(check)))
     close = sorted(
         (check for check in checks if check.passed and np.isfinite(check.used)),
         key=lambda check: -check.used,
     )
     for check in close[:MAX_NAMED_CLOSE]:
-        out.append(("close to its limit", *_compared(check)))
+        if check.name not in listed:
+            out.append(("close to its limit", *_compared(check)))
     for check in checks:
         share = f"coverage {100 * check.coverage:.0f} %"
         if check.coverage < MIN_COVERAGE:

@@ -86,7 +86,7 @@ def open_lids(vertices_mm: FloatArray, lids: Sequence[Eyelids], opening: float) 
     lids
         Lids on these vertices.
     opening
-        0 (closed, vertices as given) to 1.
+        0 (closed, vertices as given) to about 1; above 1: wider.
     """
     out = np.array(vertices_mm, np.float64)
     for one in lids if opening > 0.0 else ():
@@ -128,7 +128,7 @@ class PartsView:
         shadows
             Its caster: skin alone casts shadows.
         kinds
-            Drawn kinds of `rigsim.face_parts.hair.HAIR_KINDS`.
+            Drawn kinds of `rigsim.face_parts.hair.HAIR_KINDS`; a person may have none of them.
         opening
             Opening of the lids; 0: no eyes.
         subpixels
@@ -136,9 +136,12 @@ class PartsView:
         """
         lids = self.parts.lids if opening > 0.0 else ()
         curves, normals, width_mm = self._place_hair(skin, kinds, opening)
+        k, size = subpixels, np.array(self.camera.image_size)
+        if not lids and not len(curves):
+            none = np.zeros(size[::-1])
+            return PartsLayer(np.zeros((len(self.lights), *none.shape, 3)), none, none)
         ribbons = _build_ribbons(curves, normals, width_mm, self.camera)
         meshes = [skin, *(_build_eye(skin, one) for one in lids), ribbons]
-        k, size = subpixels, np.array(self.camera.image_size)
         at = self.camera.project(np.concatenate([one.vertices_mm for one in meshes[1:]]))
         left, top = np.clip(at.min(axis=0).astype(int), 0, size)
         right, bottom = np.clip(at.max(axis=0).astype(int) + 2, 0, size)

@@ -292,7 +292,7 @@ def test_interrupted_import_exits_as_interrupted(monkeypatch, capsys):
 
 
 def test_interrupted_command_suggests_resuming_where_possible(tmp_path):
-    """Those with the option, and no others, are told of it, once their session exists."""
+    """Those with the option, and no others, are advised to use it, once their session exists."""
     place = ["--json", f"--out={tmp_path}"]
     assert "--resume" not in errors.format_interruption(["simulate", *place])
     (tmp_path / "session.json").touch()
@@ -304,8 +304,8 @@ def test_interrupted_command_suggests_resuming_where_possible(tmp_path):
         if any("--resume" in option.opts for option in one.params)
     }
     assert resumable == set(errors.RESUMABLE_COMMANDS)
-    told = {name: errors.format_interruption([name, *place]) for name in commands}
-    assert {name for name, text in told.items() if "--resume" in text} == resumable
+    advice = {name: errors.format_interruption([name, *place]) for name in commands}
+    assert {name for name, text in advice.items() if "--resume" in text} == resumable
 
 
 @pytest.mark.parametrize(

@@ -40,13 +40,14 @@ def test_found_session_adds_rig_and_frame(tmp_path):
     store.write(tmp_path / "maps", SkinAppearance(maps, "simulated", **about))
     html = report.build([tmp_path])
     assert "Gradient rig: maps <small>maps</small>" in html
-    assert decode(html, "Gradient rig, standard layout") == DRAWING.read_bytes()
+    caption = "Gradient rig: full layout; this session used 132 lights and 1 camera"
+    assert decode(html, caption) == DRAWING.read_bytes()
     frame = pixels(html, "captured frame")
     linear = ((frame / 255 + 0.055) / 1.055) ** 2.4
     ratio = linear[:, :28].mean() / linear[:, 36:].mean()
     assert ratio == pytest.approx(0.25, rel=0.03)  # of JPEG
     without = report.build([tmp_path / "maps"])
-    assert "standard layout" not in without
+    assert "full layout" not in without
     assert "captured frame" not in without
 
 
@@ -76,5 +77,7 @@ def test_missed_check_precedes_closer_one():
     assert sentence == "Limit missed: coverage, 0.1 (limit 0.5)."
     thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
     bare = SkinAppearance({"thickness": thickness}, "measured")
-    least = "Least certain: thickness, median standard uncertainty 5 % of its value."
+    least = (
+        "Least certain: thickness, median standard uncertainty 5\N{NO-BREAK SPACE}% of its value."
+    )
     assert chapter.describe_weakest("face", [], bare) == least

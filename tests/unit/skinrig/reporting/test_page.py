@@ -203,9 +203,10 @@ def test_simplified_plot_lines_keep_position():
 
 def test_worst_skin_is_named_even_if_check_passes():
     kept = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 30 %", worst_got=25.0)
-    assert any("one group above the limit" in row for row in verdict.list_weaknesses([kept]))
+    assert any("kept; one group above the limit" in row for row in verdict.list_weaknesses([kept]))
+    assert sum(row[1] == "melanin" for row in verdict.list_weaknesses([kept])) == 1
     even = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 9 %", worst_got=8.0)
-    assert not any("one group above the limit" in row for row in verdict.list_weaknesses([even]))
+    assert not any("one group above" in row[0] for row in verdict.list_weaknesses([even]))
 
 
 def test_non_numeric_check_is_missed():

@@ -1,5 +1,7 @@
 """Eyes and hair over a rendering of the skin, on the mean head."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,20 @@ def test_hair_covers_scalp_and_not_the_face(view):
     assert layer.hidden[pixel(view, (0.0, 55.0, 0.0))] == 0.0
     assert (layer.radiance >= 0.0).all()
     assert (layer.radiance[:, layer.hidden == 0.0] == 0.0).all()
+
+
+def test_scalp_without_hair_draws_nothing(view):
+    hair = view.parts.hair
+    kept = sum(hair.counts[:2])
+    bald = replace(
+        hair, points_mm=hair.points_mm[:kept], roots=hair.roots[:kept], counts=(*hair.counts[:2], 0)
+    )
+    bare = replace(view, parts=replace(view.parts, hair=bald))
+    layer = bare.draw(view.rest, Caster(view.rest), ("scalp",), 0.0, SUBPIXELS)
+    skin, coverage = np.full((len(LIGHTS_DEG), 270, 240, 3), 0.4), np.full((270, 240), 0.5)
+    radiance, covered = layer.draw_over(skin, coverage)
+    np.testing.assert_array_equal(radiance, skin)
+    np.testing.assert_array_equal(covered, coverage)
 
 
 def test_layer_hides_skin_by_its_fraction():
