@@ -145,32 +145,37 @@ def _draw_captured(appearance: SkinAppearance, session: Session | None) -> list[
 
 
 def _choose_frame(session: Session) -> list[FrameRecord]:
-    """Return a lit frame of the most frontal camera, in the middle of a session; may be empty."""
+    """Return a frame of the most frontal camera and light, in the middle of those; may be empty."""
     lit = [
         one
         for one in session.frames()
         if OMITTED_FRAMES.isdisjoint((one.kind, one.index.get("pattern")))
     ]
     cosines = {
-        view.name: view.position_mm[2] / math.hypot(*view.position_mm) for view in session.rig.views
+        part.name: part.position_mm[2] / (math.hypot(*part.position_mm) or 1.0)
+        for part in (*session.rig.lights, *session.rig.views)
     }
-    camera = max((one.camera for one in lit), key=cosines.__getitem__, default="")
-    lit = [one for one in lit if one.camera == camera]
-    return lit[len(lit) // 2 :][:1]
+    names = [(one.camera, str(one.settings.get("light"))) for one in lit]
+    ranks = [(cosines.get(camera, 0.0), cosines.get(light, 0.0)) for camera, light in names]
+    best = max(ranks, default=None)
+    first = [one for one, rank in zip(lit, ranks, strict=True) if rank == best]
+    return first[len(first) // 2 :][:1]
 
 
 def _draw_frame(session: Session, record: FrameRecord) -> page.Image:
     """Return a frame of a session at its own exposure."""
     frame = session.read(record)
     if frame.pattern == "MONO":
+        balanced = ""
         values, _, _ = raw.linear_mono(frame, **_UNUSED_NOISE)
         linear: FloatArray = np.repeat(values[..., None], 3, axis=-1)
     else:
+        balanced = " after white balance"
         balance: FloatArray = np.array(frame.neutral or (1.0, 1.0, 1.0), np.float32)
         linear = raw.linear_rgb(frame, demosaic="centered", **_UNUSED_NOISE).rgb / balance
     white = map_images.find_white(linear, np.ones(linear.shape[:2], bool))
     title = (
         f"captured frame, camera {record.camera}, step {record.step_id}; "
-        f"white is {white:.2g} of full scale"
+        f"white is {white:.2g} of full scale{balanced}"
     )
     return map_images.draw_color_image(title, linear / white, lossy=True)
