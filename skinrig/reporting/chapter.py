@@ -151,10 +151,9 @@ def _choose_frame(session: Session) -> list[FrameRecord]:
         for one in session.frames()
         if OMITTED_FRAMES.isdisjoint((one.kind, one.index.get("pattern")))
     ]
-    cosines = {
-        part.name: part.position_mm[2] / (math.hypot(*part.position_mm) or 1.0)
-        for part in (*session.rig.lights, *session.rig.views)
-    }
+    places = {one.name: one.position_mm for one in session.rig.lights}
+    places |= {one.name: one.position_mm for one in session.rig.views}
+    cosines = {name: at[2] / (math.hypot(*at) or 1.0) for name, at in places.items()}
     names = [(one.camera, str(one.settings.get("light"))) for one in lit]
     ranks = [(cosines.get(camera, 0.0), cosines.get(light, 0.0)) for camera, light in names]
     best = max(ranks, default=None)
