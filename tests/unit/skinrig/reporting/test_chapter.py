@@ -4,6 +4,7 @@ import base64
 import io
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
@@ -49,6 +50,23 @@ def test_found_session_adds_rig_and_frame(tmp_path):
     without = report.build([tmp_path / "maps"])
     assert "full layout" not in without
     assert "captured frame" not in without
+
+
+def test_frontal_lit_frame_is_chosen():
+    def place(name, *position_mm):
+        return SimpleNamespace(name=name, position_mm=position_mm)
+
+    def frame(kind, camera, light):
+        return SimpleNamespace(kind=kind, camera=camera, index={}, settings={"light": light})
+
+    lights = place("L0", 0.0, 900.0, 0.0), place("L1", 0.0, 300.0, 800.0)
+    cameras = place("C0", 800.0, 0.0, 300.0), place("C1", 100.0, 0.0, 900.0)
+    lit = [frame("olat", camera, light) for camera in ("C0", "C1") for light in ("L0", "L1")]
+    others = [frame(kind, "C1", "L1") for kind in ("tracking", "dark") for _ in range(5)]
+    session = SimpleNamespace(
+        rig=SimpleNamespace(lights=lights, views=cameras), frames=lambda: lit + others
+    )
+    assert chapter._choose_frame(session) == [lit[3]]
 
 
 def test_captured_image_is_neither_burnt_nor_black():
