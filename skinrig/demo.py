@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -66,14 +66,13 @@ BENCH_STAGES = (
 )
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 20.0
+ENDING_S = 5.0
+"""Typical seconds of benchmarks and the report after the last part."""
 TYPICAL_SECONDS = {
     **{"flash": 45.0, "dome": 100.0, PHOTOGRAPHS_PART: 10.0, "gradient": 60.0, "probe": 30.0},
     **{HEAD_PART: 5.0, PERSON_PART: 7.0, FACE_PART: 6.0},
 }
-"""Seconds of each part while another one runs, on two cores.
-
-They lie between those with and without compiled kernels.
-"""
+"""Seconds of each part while another one runs, between those with and without compiled kernels."""
 REPORT_NAME = "report.html"
 MARK_NAME = ".skinrig-demo"
 """File that marks the folder of a demo."""
@@ -110,7 +109,7 @@ def run_demo(
     width_px
         Width of the simulated camera's images, pixels; None: that of the small scale.
     jobs
-        Rigs that run in parallel, one process each; None: two if there are two cores.
+        Parts that run in parallel, one process each; None: two if there are two cores.
     """
     unknown = [rig for rig in rigs if rig not in RIGS]
     if unknown or not rigs:
@@ -118,12 +117,12 @@ def run_demo(
     if seed < 0:
         raise DemoError(f"seed: got {seed}, expected 0 or more")
     asked = [rig for rig in RIGS if rig in rigs]
-    at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
-    at_once = _require_resources(asked, out, width_px, at_once)
+    needs, own = list_parts(asked), SecondsByStep()
+    at_once = jobs or min(len(asked), MAX_JOBS, os.cpu_count() or 1)
+    at_once = _require_resources(asked, out, width_px, min(at_once, len(needs)))
     _make_room(out)
     began = time.perf_counter()
     parts: _Parts = {}
-    needs, own = list_parts(asked), SecondsByStep()
     drawn: DrawnSections | None = None
     for name, part in _run_parts(needs, (out, seed, width_px, console), at_once):
         parts[name] = part
@@ -131,13 +130,14 @@ def run_demo(
         waiting = [one for one in needs if one not in parts]
         if waiting and name in (*asked, PERSON_PART):
             _write_report(out, parts, _sum_up(needs, parts), waiting=waiting, drawn=drawn)
+            ended = f"{name}: done, {len(parts.keys() & asked)} of {len(asked)} rigs"
             console.print_line(
-                f"{name}: done, {len(parts.keys() & asked)} of {len(asked)} rigs, "
-                f"about {_estimate_left_s(parts, waiting, at_once):.0f} s left; "
+                f"{ended if name in asked else 'fused person: done'}, "
+                f"about {_estimate_left_s(parts, needs, at_once):.0f} s left; "
                 f"the report so far: {out / REPORT_NAME}"
             )
         if name in asked and parts.keys() >= {*asked}:  # while the person is fused
-            bench_passed = _measure_stages(out, own, console)
+            _measure_stages(out, own, console)
     found, shares = _sum_up(needs, parts)
     shares |= own
     with _time_step("report", shares, console):
@@ -153,7 +153,7 @@ def run_demo(
         for rig in asked
     ]
     console.print_table(("step", "seconds"), [*shares.items(), *by_rig])
-    parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
+    parallel = f", {at_once} parts in parallel" if at_once > 1 else ""
     total_s = time.perf_counter() - began
     console.print_line(f"\ntotal: {total_s:.1f} s{parallel}")
     for step in suggest(scan(out), out):
@@ -163,7 +163,6 @@ def run_demo(
         "seconds": shares,
         "total_s": total_s,
         "errors": found.errors,
-        "bench_passed": bench_passed,
         "report": out / REPORT_NAME,
     }
 
@@ -202,14 +201,13 @@ def _sum_up(needs: Iterable[str], parts: _Parts) -> _Part:
     return found, shares
 
 
-def _measure_stages(out: Path, seconds: SecondsByStep, console: Console) -> bool:
-    """Measure the benchmark's stages into ``out``; return whether they kept their limits."""
+def _measure_stages(out: Path, seconds: SecondsByStep, console: Console) -> None:
+    """Measure the benchmark's stages at small size into ``out``."""
     from skinrig.benchmarks.stages import run_stages
 
     quiet = replace(console, quiet=True)  # the report shows its tables
     with _time_step("measure error against run time", seconds, console):
-        found = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
-    return bool(found["passed"])
+        run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
 
 
 def _keep_sections() -> "DrawnSections":
@@ -232,7 +230,8 @@ def _write_report(
 
     found, shares = results
     spent = DemoResults()
-    spent.add_table("Seconds", ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
+    timed = "Seconds; those of parts and benchmarks that ran at the same time are upper bounds"
+    spent.add_table(timed, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
     document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
     document["tables"] = spent.tables + found.tables
     # run times differ from run to run, so they go to a document of their own, not into the maps
@@ -249,18 +248,25 @@ def _write_report(
             if names & set(one.name.split("-")) and not one.name.startswith(".")
         ]
         paths += [one for one in (written, out / "bench.json") if one.exists()]
-        title += f": {', '.join(rig for rig in RIGS if rig in done)}; "
-        title += f"to follow: {', '.join(waiting)}"
+        for separator, some in ((": ", done), ("; to follow: ", waiting)):
+            rigs = ", ".join(rig for rig in RIGS if rig in some)
+            named = [one for one in (rigs, PERSON_PART in some and "the fused person") if one]
+            title += separator + " and ".join(named) if named else ""
     reload_s = RELOAD_S if waiting else None
     html = build(paths, title=title, reload_s=reload_s, folder=out, drawn=drawn)
     write_atomically(out / REPORT_NAME, html)
 
 
-def _estimate_left_s(parts: _Parts, waiting: Sequence[str], at_once: int) -> float:
+def _estimate_left_s(parts: _Parts, needs: Mapping[str, Sequence[str]], at_once: int) -> float:
     """Return the time left, s, from typical seconds and this machine's pace so far."""
     pace = sum(sum(part[1].values()) for part in parts.values())
-    pace /= sum(TYPICAL_SECONDS[rig] for rig in parts)
-    return pace * sum(TYPICAL_SECONDS[rig] for rig in waiting) / at_once
+    pace /= sum(TYPICAL_SECONDS[name] for name in parts)
+    end_s = dict.fromkeys(parts, 0.0)  # earliest end of each, after all that it needs
+    for name, before in needs.items():
+        if name not in parts:
+            end_s[name] = TYPICAL_SECONDS[name] + max((end_s[one] for one in before), default=0.0)
+    shared_s = sum(TYPICAL_SECONDS[name] for name in needs if name not in parts) / at_once
+    return pace * max(shared_s, *end_s.values()) + ENDING_S
 
 
 def _run_parts(
@@ -309,15 +315,12 @@ def _run_in_processes(
 
 
 class _Schedule:
-    """Parts that begin in a pool when those that they need are done.
-
-    This process may draw a report meanwhile.
-    """
+    """Parts that begin in a pool when those that they need are done, while reports are drawn."""
 
     def __init__(self, pool: Executor, needs: Mapping[str, Sequence[str]], order: _Order):
         self._pool, self._needs, self._order = pool, needs, order
         self._begun: dict[str, Future[_Part]] = {}
-        self._ended: SimpleQueue[str] = SimpleQueue()
+        self._ended: SimpleQueue[tuple[str, Exception | None]] = SimpleQueue()
         self._lock = threading.RLock()
 
     def begin_ready(self) -> None:
@@ -331,16 +334,19 @@ class _Schedule:
                     self._begun[name].add_done_callback(partial(self._end, name))
 
     def wait_for_next(self) -> tuple[str, _Part]:
-        """Return the next part that ends; raise its error, or that of a pool that ended."""
-        self.begin_ready()
-        name = self._ended.get()
+        """Return the next part that ends; raise its error, or that of the start of others."""
+        name, error = self._ended.get()
+        if error is not None:
+            raise error
         return name, self._begun[name].result()
 
     def _end(self, name: str, future: Future[_Part]) -> None:
-        if _has_succeeded(future):
-            with suppress(RuntimeError):  # the pool ended; `wait_for_next` raises this error
+        try:
+            if _has_succeeded(future):
                 self.begin_ready()
-        self._ended.put(name)
+            self._ended.put((name, None))
+        except Exception as error:  # without an entry, `wait_for_next` would wait for ever
+            self._ended.put((name, error))
 
 
 def _has_succeeded(future: Future[_Part]) -> bool:

@@ -208,7 +208,7 @@ def format_interruption(given: Sequence[str]) -> str:
     >>> format_interruption(["simulate", "flash", "--out", "not-begun"])
     'interrupted; run the same command again'
     >>> format_interruption(["bench", "--out", "bench"])
-    'interrupted; bench.json in --out keeps what was measured'
+    'interrupted; bench.json in --out keeps what was measured; run the same command to continue'
     """
     command = find_command(given)
     if command == "serve":  # it resumes from the session of its client, not from its own
@@ -218,7 +218,8 @@ def format_interruption(given: Sequence[str]) -> str:
     if command in RESUMABLE_COMMANDS and out and Path(out, "session.json").is_file():
         return "interrupted; run the same command with --resume to continue"
     if command == "bench" and out and "--extremes" not in given:
-        return "interrupted; bench.json in --out keeps what was measured"
+        again = "" if "--stage" in words else "; run the same command to continue"
+        return f"interrupted; bench.json in --out keeps what was measured{again}"
     if command == "reconstruct":
         return "interrupted; run the same command again: it takes up the finished stages"
     return "interrupted; run the same command again"

@@ -67,7 +67,8 @@ def run_stages(
         that fit into the budget at full size, the quickest first; finished stages of an earlier
         run are not measured again.
     budget_s
-        Time budget in seconds; a stage that would begin after its end is omitted and listed.
+        Time budget in seconds; a stage that would begin after its end is omitted, and listed
+        unless an earlier run finished it.
     toy
         Whether to measure small sizes only, with a single call of each function, which checks that
         the benchmark runs.
@@ -219,8 +220,9 @@ class _Run:
         """Return the document of the run, complete or interrupted."""
         document = to_document(list(self.done.values()))
         document |= {"toy": self.toy, "code": code_digest(MEASURED_PACKAGES)}
-        document["left_out"] = [list(item) for item in self.omitted]
-        document["left_out"] += [[name, INTERRUPTED_REASON] for name in self.to_do]
+        lacking = [*self.omitted, *((name, INTERRUPTED_REASON) for name in self.to_do)]
+        kept = self.list_finished() - self.done.keys()
+        document["left_out"] = [list(item) for item in lacking if item[0] not in kept]
         of_run = self.done.keys() | {name for name, _ in document["left_out"]}
         document["left_out"] += [i for i in self.earlier["left_out"] if i[0] not in of_run]
         for name, made in self.done.items():

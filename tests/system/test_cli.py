@@ -313,6 +313,7 @@ def test_interrupted_command_suggests_resuming_where_possible(tmp_path):
     [
         (["--out", "b"], True),
         (["--out=b", "--smoke"], True),
+        (["--out", "b", "--stage", "hdr"], True),
         ([], False),
         (["--extremes", "--out", "b"], False),
     ],
@@ -329,7 +330,9 @@ def test_interrupted_benchmark_reports_location_of_measurements(
     monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", interrupted)
     monkeypatch.setattr("skinrig.reporting.sections.extremes.run_extremes", interrupted)
     assert main(["bench", *argv]) == 130
-    assert ("bench.json in --out keeps" in capsys.readouterr().err) == kept
+    text = capsys.readouterr().err
+    assert ("bench.json in --out keeps" in text) == kept
+    assert ("to continue" in text) == (kept and "--stage" not in argv)
 
 
 @pytest.mark.parametrize(("own", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])

@@ -3,6 +3,8 @@
 import json
 import multiprocessing
 import os
+import threading
+from concurrent.futures import Future
 
 import pytest
 from fixtures import small_demo
@@ -13,6 +15,7 @@ from skinrig import demo
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RUN_BY_PART, DemoError, run_demo
+from skinrig.demo_rigs import DemoResults
 from skinrig.simulating.orders import SimulationError
 from skinrig.viewer.faces import build_scene
 
@@ -22,7 +25,7 @@ MAX_REPORT_BYTES = 3_000_000
 @pytest.fixture
 def without_benchmarks(monkeypatch):
     """Benchmarks have tests of their own, and take as long as they are allowed to."""
-    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", lambda *_, **__: {"passed": True})
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", lambda *_, **__: {})
 
 
 @pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])
@@ -86,17 +89,17 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
     assert built == [
         (
             ["session-flash-white", "demo.json"],
-            "skinrig demo: flash; to follow: dome, head, photographs, person, face",
+            "skinrig demo: flash; to follow: dome and the fused person",
             10,
         ),
         (
             ["session-dome-white", "session-flash-white", "demo.json"],
-            "skinrig demo: flash, dome; to follow: head, photographs, person, face",
+            "skinrig demo: flash, dome; to follow: the fused person",
             10,
         ),
         (
             ["double", "session-dome-white", "session-flash-white", "demo.json"],
-            "skinrig demo: flash, dome; to follow: face",
+            "skinrig demo: flash, dome and the fused person",
             10,
         ),
         (["demo"], "skinrig demo", None),
@@ -109,6 +112,37 @@ def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     with pytest.raises(SimulationError, match="width"):
         run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.timeout(30)
+def test_process_that_cannot_start_ends_the_wait():
+    begun = Future()
+
+    class Pool:
+        def submit(self, _run, name, _given):
+            if name == "probe":
+                raise OSError("no process")
+            return begun
+
+    schedule = demo._Schedule(Pool(), {"flash": (), "probe": ("flash",)}, ())
+    schedule.begin_ready()
+    later = threading.Timer(0.1, begun.set_result, [(DemoResults(), {})])
+    later.start()
+    with pytest.raises(OSError, match="no process"):
+        schedule.wait_for_next()
+    later.join()
+
+
+def test_time_left_covers_the_longest_chain_of_needs():
+    needs = demo.list_parts(["flash", "dome"])
+    typical = demo.TYPICAL_SECONDS
+    parts = {name: (None, {"all": 2 * typical[name]}) for name in ("flash", "dome", "photographs")}
+    chain_s = sum(typical[name] for name in ("head", "person", "face"))
+    left_s = demo._estimate_left_s(parts, needs, 2)  # at half the pace
+    assert left_s == pytest.approx(2 * chain_s + demo.ENDING_S)
+    del parts["photographs"], parts["dome"]
+    in_turn_s = sum(typical[name] for name in needs.keys() - {"flash"})
+    assert demo._estimate_left_s(parts, needs, 1) == pytest.approx(2 * in_turn_s + demo.ENDING_S)
 
 
 @pytest.mark.long

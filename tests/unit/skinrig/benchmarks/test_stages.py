@@ -160,6 +160,15 @@ def test_later_run_keeps_finished_stages(calls, tmp_path, capsys):
     bench_table.write_tables(document, tmp_path)
 
 
+def test_finished_stage_survives_run_without_budget(calls, tmp_path, capsys):
+    for budget_s, names in ((600.0, ["a"]), (-1.0, ["a", "b"]), (-1.0, None)):
+        document = run(budget_s, names, out=tmp_path)
+        assert document["stages"]["a"]["size"] == "full"
+    assert [name for name, _ in document["left_out"]] == ["b", "c"]
+    run(600.0, out=tmp_path)
+    assert [call for call in calls[1:] if call[0] == "a"] == [("a", "full")]
+
+
 def test_interrupted_stage_is_measured_again(calls, tmp_path, capsys):
     calls[0]["c"] = stage("c", calls, error=KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
