@@ -4,6 +4,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -112,9 +113,7 @@ def suggest_after_session(
     kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
     if kind is None:
         return f"skinrig verify {place}"
-    near = scan(Path(session).parent).sessions.items()
-    found = {_target(d): p for p, d in near if d.get("rig", {}).get("name") == rig}
-    found[target] = Path(session)
+    found = _find_targets(rig, session) | {target: Path(session)}
     targets = TARGETS_BY_CALIBRATION.get((kind, target), (target,))
     placed = (rig, kind) != ("dome", "lights") or Path(calibration, "geometry.json").is_file()
     for other in (*targets, *(() if placed else ("charuco",))):
@@ -126,14 +125,60 @@ def suggest_after_session(
     return f"skinrig calibrate {kind} {given} --out {store}"
 
 
+def suggest_after_geometry(session: str | Path, calibration: str | Path) -> str | None:
+    """Return the next command for the lights of a dome whose cameras were calibrated.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder of the calibration board.
+    calibration
+        CALIBRATION/ folder for the command.
+
+    Returns
+    -------
+    str or None
+        None if no session of the mirror or of the white target of this dome is near.
+
+    Examples
+    --------
+    >>> suggest_after_geometry("session-charuco", "calibration")
+    """
+    found = _find_targets("dome", session)
+    for target in TARGETS_BY_CALIBRATION["lights", "mirror"]:
+        if target in found:
+            source = str(_read_session(session).get("source", "simulated"))
+            return suggest_after_session(
+                "dome", found[target], target, calibration=calibration, source=source
+            )
+    return None
+
+
+def _read_session(session: str | Path) -> dict[str, Any]:
+    return read_document(Path(session) / "session.json") or {}
+
+
+def _find_targets(rig: str, session: str | Path) -> dict[str, Path]:
+    """Return the sessions near a session, of the same rig, seed and source, by their target."""
+    own = _read_session(session)
+    return {
+        _target(document): path
+        for path, document in scan(Path(session).parent).sessions.items()
+        if document.get("rig", {}).get("name") == rig
+        and all(document.get(key) == own.get(key) for key in ("seed", "source"))
+    }
+
+
 def _suggest_target(rig: str, session: str | Path, target: str, source: str) -> str:
     """Return the command that makes the session of a target on the rig of another session."""
     made = "capture" if source == "measured" else "simulate"
-    seed = (read_document(Path(session) / "session.json") or {}).get("seed")
+    seed = _read_session(session).get("seed")
     option = f" --seed {seed}" if seed and made == "simulate" else ""
-    out = f"session-{target}"
-    out = f"session-{rig}-{target}" if Path(out).exists() else out
-    return f"skinrig {made} {rig} --target {target}{option} --out {out}"
+    first = out = Path(session).parent / f"session-{target}"
+    numbers = count(2)
+    while out.exists():
+        out = Path(f"{first}-{next(numbers)}")
+    return f"skinrig {made} {rig} --target {target}{option} --out {shell_quote(out)}"
 
 
 def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:

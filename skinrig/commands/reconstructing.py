@@ -23,7 +23,7 @@ from skinrig.command_line.renamed_options import replace_former_values
 from skinrig.commands.dynamic import print_fit
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
-from skinrig.next_steps import shell_quote, suggest
+from skinrig.next_steps import shell_quote, suggest, suggest_after_geometry
 from skinrig.studies.executors import check_executor
 from skinrig.workspace import scan
 
@@ -78,12 +78,14 @@ def calibrate(
     ]
     verdict = f"check {' and '.join(remarks)} before use" if remarks else "usable, no finding"
     console.print_line(f"{done.path}: {verdict}; valid until {done.calibration.valid_until}")
+    lights = suggest_after_geometry(sessions[0], out) if kind == "geometry" else None
     near = scan(out.parent)
     rig = done.calibration.rig
     own = {p: d for p, d in near.sessions.items() if d.get("rig", {}).get("name") == rig}
-    for step in suggest(replace(near, sessions=own), out.parent):
-        if step.command.startswith("skinrig reconstruct"):
-            console.print_line(f"next: {step.command}")
+    steps = suggest(replace(near, sessions=own), out.parent)
+    after = [s.command for s in steps if s.command.startswith("skinrig reconstruct")]
+    for line in [lights] if lights else after:
+        console.print_line(f"next: {line}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
     console.print_document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 

@@ -38,13 +38,16 @@ def follow(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("rig", CALIBRATION_BY_TARGET)
-def test_simulated_targets_lead_to_calibrations(rig, follow, tmp_path):
-    for target in CALIBRATION_BY_TARGET[rig]:
+@pytest.mark.parametrize(
+    ("rig", "targets"), [*CALIBRATION_BY_TARGET.items(), ("dome", {"mirror": "lights"})]
+)
+def test_simulated_targets_lead_to_calibrations(rig, targets, follow, tmp_path):
+    for target in targets:
         out = f"session-{target}"
         if not (tmp_path / out).exists():  # else a target before has led to it
             ran, _ = follow("simulate", rig, "--target", target, "--out", out)
             assert ran[-1].startswith("calibrate")
+    assert {path.stem for path in tmp_path.glob("calibration/*.json")} >= {*targets.values()}
 
 
 def test_photographs_lead_to_reports(follow, tmp_path):

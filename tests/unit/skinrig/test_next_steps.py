@@ -12,6 +12,7 @@ from skinrig.next_steps import (
     OPEN_COMMAND,
     format_welcome,
     suggest,
+    suggest_after_geometry,
     suggest_after_session,
 )
 from skinrig.reporting import page
@@ -19,9 +20,10 @@ from skinrig.reporting.page import render_page
 from skinrig.workspace import scan
 
 
-def session(path, rig="flash", kinds=("dark", "subject"), target=""):
+def session(path, rig="flash", kinds=("dark", "subject"), target="", **more):
     path.mkdir()
     document = {
+        **more,
         "rig": {"name": rig},
         "plan": {"steps": [{"kind": kind} for kind in kinds]},
         "extra": {"simulation": {"target": target}} if target else {},
@@ -224,7 +226,7 @@ def test_dome_lights_follow_both_targets_and_geometry():
     made = "skinrig simulate dome --target white --out session-white"
     assert after("a", "mirror") == made
     session(Path("session-white"), "flash", target="white")
-    assert after("a", "mirror") == made.replace("session-white", "session-dome-white")
+    assert after("a", "mirror") == f"{made}-2"
     assert after("b", "white", "measured").startswith("skinrig capture dome --target mirror")
     session(Path("b"), "dome", target="white")
     assert after("a", "mirror").startswith("skinrig simulate dome --target charuco")
@@ -234,6 +236,29 @@ def test_dome_lights_follow_both_targets_and_geometry():
     assert after("a", "mirror") == "skinrig calibrate lights a b --out calibration"
     made = suggest_after_session("flash", "d", "dark")
     assert made == "skinrig simulate flash --target flat --out session-flat"
+
+
+def test_lights_follow_geometry_by_targets_of_the_same_dome():
+    folder = Path("my rigs")
+    folder.mkdir()
+    for name, seed, target in (
+        ("charuco", 1, "charuco"),
+        ("mirror", 1, "mirror"),
+        ("other-white", 2, "white"),
+        ("session-white", 2, "white"),
+        ("session-white-2", 2, "charuco"),
+    ):
+        session(folder / name, "dome", target=target, seed=seed, source="simulated")
+    assert suggest_after_geometry(folder / "charuco", "store") == (
+        "skinrig simulate dome --target white --seed 1 --out 'my rigs/session-white-3'"
+    )
+    session(folder / "white", "dome", target="white", seed=1, source="simulated")
+    calibration(Path("store"), "dome", "geometry")
+    assert suggest_after_geometry(folder / "charuco", "store") == (
+        "skinrig calibrate lights 'my rigs/mirror' 'my rigs/white' --out store"
+    )
+    session(folder / "captured", "dome", target="charuco", source="measured")
+    assert suggest_after_geometry(folder / "captured", "store") is None
 
 
 def test_nothing_typed_prints_the_next_steps(capsys):
