@@ -218,8 +218,9 @@ def format_interruption(given: Sequence[str]) -> str:
     if command in RESUMABLE_COMMANDS and out and Path(out, "session.json").is_file():
         return "interrupted; run the same command with --resume to continue"
     if command == "bench" and out and "--extremes" not in given:
-        again = "" if "--stage" in words else "; run the same command to continue"
-        return f"interrupted; bench.json in --out keeps what was measured{again}"
+        kept = "interrupted; bench.json in --out keeps what was measured"
+        named = {"--stage", "--end-to-end"} & {*words}  # these are measured again
+        return kept if named else f"{kept}; run the same command to continue"
     if command == "reconstruct":
         return "interrupted; run the same command again: it takes up the finished stages"
     return "interrupted; run the same command again"
