@@ -238,7 +238,7 @@ def test_dome_lights_follow_both_targets_and_geometry():
     assert made == "skinrig simulate flash --target flat --out session-flat"
 
 
-def test_lights_follow_geometry_by_targets_of_the_same_dome():
+def test_lights_after_geometry_are_of_same_dome():
     folder = Path("my rigs")
     folder.mkdir()
     for name, seed, target in (
