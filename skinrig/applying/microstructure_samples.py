@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -250,9 +250,7 @@ def _draw_patch(
     pushed = push_block(block, Push())
     progress("strain and convolution")
     moved, field = pushed.convolve(neutral, table=relief.table)
-    rest = PushedPatch(
-        pushed.rest_mm, pushed.rest_mm, pushed.tetrahedra, pushed.surface, pushed.width_mm, 0
-    )
+    rest = replace(pushed, deformed_mm=pushed.rest_mm)
     shown = (("neutral", rest, neutral), ("pushed, static", pushed, neutral))
     figure, axes = new_figure(10.5, 4.0, 1, 3)
     images = []
