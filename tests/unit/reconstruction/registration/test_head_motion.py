@@ -239,7 +239,7 @@ def test_frames_without_motion_cues_are_refused_by_name(rng):
 
 
 @pytest.mark.parametrize("noise_px", [0.3, 0.5])
-def test_worst_part_is_compared_among_frames_of_like_light(noise_px, rng):
+def test_dark_rigid_frames_keep_their_worst_part(noise_px, rng):
     points = rng.uniform(-60.0, 60.0, (600, 3)) * [1.0, 1.0, 0.1]
     dark = np.arange(12) >= 7
     scale = np.where(dark, noise_px, 0.02)

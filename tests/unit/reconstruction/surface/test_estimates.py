@@ -406,7 +406,7 @@ def test_lobe_errors_fall_with_views_only(new_views, factor):
     np.testing.assert_allclose(relative[1], factor * relative[0], rtol=0.02)
 
 
-def test_lobe_errors_are_at_least_those_of_independent_samples():
+def test_lobe_errors_reach_those_of_independent_samples():
     truth, basis = cap(20), brdf_tables.default_basis()
     samples = make(truth, lobe=lambda angle: 0.3 * np.exp(-((angle / 0.3) ** 2)))
     alone = dataclasses.replace(samples, view=np.arange(len(samples.view)))
