@@ -243,7 +243,7 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         steps.append(Step(command, "a session from the photographs"))
     if not steps:
         steps = [
-            Step("skinrig demo", "all four rigs, simulated, in less than three minutes"),
+            Step("skinrig demo", "all four rigs, simulated; two to five minutes"),
             Step("skinrig simulate flash --out session", "one simulated rig, with real drivers"),
             Step("skinrig photo FACE.jpg --out portrait", "maps of the face in your photograph"),
             Step("skinrig doctor", "a check of the installation, with fixes"),
