@@ -26,7 +26,7 @@ RAYLEIGH_MEDIAN = 1.1774100225154747
 
 
 def residual_scales(residual_px: Float64Array) -> Float64Array:
-    """Return the scale of each frame's residuals (T,), as deviations of one coordinate."""
+    """Return the scale of each frame's residuals, px, (T,): standard deviations of a coordinate."""
     return np.array([_middle(row) / RAYLEIGH_MEDIAN for row in residual_px])
 
 

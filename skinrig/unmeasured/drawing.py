@@ -52,7 +52,7 @@ class PartsLayer:
     Attributes
     ----------
     radiance : ndarray of float64, shape (L, H, W, 3)
-        By light; 0 outside the parts, averaged over each pixel.
+        By light, relative to a white patch's; 0 outside the parts, averaged over each pixel.
     coverage : ndarray of float64, shape (H, W)
         Fraction of a pixel that eyes and hair cover, 0 to 1.
     hidden : ndarray of float64, shape (H, W)

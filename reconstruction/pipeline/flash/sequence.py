@@ -106,7 +106,7 @@ def _curves(inputs: Inputs) -> bytes:
             name: dict(zip(columns, curve, strict=True))
             for name, curve in zip(places, curves, strict=True)
         },
-        "common_log_stderr": blood.common_log_sd,
+        "common_half_width": blood.common_half_width,
     }
     if prompt_s > 0:
         document |= _cycle_document(time, phase, blood, prompt_s, session, list(places))

@@ -68,8 +68,8 @@ class SkinColorModel:
         common = estimate_face_optics(rgb, self.table, prior=self.prior, has_white=self.has_white)
         log_color = np.zeros(3) if common is None else common.log_color
         exact = replace(self, table=with_exact_optics(self.table))
-        log_sd = 0.0 if common is None else common.blood_half_width
-        return exact, np.exp(-log_color).astype(np.float32), log_sd
+        half_width = 0.0 if common is None else common.blood_half_width
+        return exact, np.exp(-log_color).astype(np.float32), half_width
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ class SiteBlood:
     the face has not moved."""
     moved: BoolArray
     """(N,): frames in which the face has moved."""
-    common_log_sd: float
+    common_half_width: float
     """Relative 68 % half-width of all blood, by optics of the face."""
 
 
@@ -111,14 +111,14 @@ def average_disc_blood(
         (N,): frames in which the face has moved.
     """
     # a disc alone hardly determines the optics, which are those of the face
-    exact, factor, common_log_sd = light.of_face(maps[0])
+    exact, factor, common_half_width = light.of_face(maps[0])
     found = [
         _of_place(maps, factor, (name, place), radius_px, exact, moved)
         for name, place in positions.items()
     ]
     parts = zip(*((one.mean, one.stderr, one.pixels) for one, _ in found), strict=True)
     joined = DiscMeans(*map(np.concatenate, parts))
-    return SiteBlood(joined, np.array([of_pose for _, of_pose in found]), moved, common_log_sd)
+    return SiteBlood(joined, np.array([of_pose for _, of_pose in found]), moved, common_half_width)
 
 
 def _of_place(
